@@ -17,6 +17,7 @@ FILES = (
     "hosts.example.toml",
     "scenarios",
     "plants",
+    "nftables",
     "sysctl",
     "udev",
 )

@@ -7,8 +7,8 @@ and never raises; a lost link is `DriveStatus.LOST`. Run it: python examples/own
 from __future__ import annotations
 
 from services.joint.differential import joint_torque, motor_from_joint
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from shared.bus.messages import Pair
+from services.joint.drivers.base import DriveReading, MotorTarget
+from shared.bus.messages import DriveStatus, Pair
 from shared.clock import NS_PER_S
 
 GEAR_RATIO = 17.5

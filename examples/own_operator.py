@@ -12,8 +12,7 @@ from services.simulator.physics.operator import HandForce, Operator
 from shared.config.files import load
 from shared.config.scenarios import Keyframe, Lead, Scenario
 from shared.places import DEFAULT_CONFIG
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 LIMIT = 12.0  # N
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import platform
 import shutil
 import sys
 from pathlib import Path
@@ -22,22 +21,21 @@ from shared.places import CHECKOUT
 _PLOT: Final = ("matplotlib", "PIL")
 
 EXTRAS: Final = {
-    "sim": ("mujoco", *_PLOT),
+    "sim": ("mujoco", "scipy", *_PLOT),
     "plot": _PLOT,
-    "design": ("cvxpy",),
+    "design": ("cvxpy", "scipy"),
     "view": ("aiohttp",),
     "foxglove": ("foxglove",),
     "ros2": ("rosbags",),
     "usb": ("odrive",),
-    "pad": ("evdev",),
-    "learn": ("gymnasium",),
+    "pad": ("sdl2", "sdl2dll"),
     "cluster": ("distributed",),
     "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
 }
 """The packages of each extra, as they are imported."""
 
-UNLOCKED: Final = frozenset({"bench"} if platform.machine() == "x86_64" else {"bench", "pad"})
-"""Extras that `requirements.lock` does not hold: evdev has no wheel for other machines."""
+UNLOCKED: Final = frozenset({"bench"})
+"""Extras that `requirements.lock` does not hold."""
 
 ON_ROBOTS: Final = frozenset({"ros2", "usb"})
 """Extras of some robots: `./deploy/install --runtime NAME` adds one, from a lock of its own."""

@@ -1,17 +1,19 @@
-"""Where this project's own files are, and which robot file is meant.
+"""Where this project's own files are, which robot file is meant, and who the user is.
 
 In a checkout its data files lie in `deploy/`. A wheel has the same files in `shared/files/`
-(`deploy/build_hook.py`); then there is no source tree around the packages, and no git.
+(`deploy/build_hook.py`); then there is no source tree around the packages, and no git. The user may
+have neither a name nor a home, as a container's.
 """
 
 from __future__ import annotations
 
+import getpass
 import os
 import sys
 from pathlib import Path
 from typing import Final
 
-from shared.exceptions import ConfigError, RunError
+from shared.exceptions import ConfigError, RunError, XrlError
 
 CHECKOUT: Final = Path(__file__).resolve().parents[1]
 """Top of this checkout; where the packages are installed, the folder that holds them."""
@@ -84,3 +86,23 @@ def robot_file_here() -> Path | None:
 def config_argument(text: str) -> Path:
     """Return the robot file for the text of `--config`, or for `NOT_NAMED`."""
     return robot_file(None if text == NOT_NAMED else Path(text))
+
+
+def user_name() -> str:
+    """Return the user's name, or `uid N` where the system knows none; never raises."""
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError, ImportError):
+        name = ""
+    shown = "".join(c for c in name.encode(errors="replace").decode() if c.isprintable())
+    return shown or f"uid {os.getuid()}"
+
+
+def in_home(path: str | Path) -> Path:
+    """Return a path with its `~` replaced by a home; XrlError if there is no such home."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise XrlError(
+            f"{path}: {user_name()} knows no such home directory; set HOME, or write a whole path"
+        ) from None

@@ -77,7 +77,7 @@ class OwnLife:
 def _set_robust_list(head: _Head) -> bool:
     """Have the kernel mark the entry when this thread ends; False if it does not.
 
-    The C library's own list of this thread, of mutexes between processes, is none's any more.
+    This replaces the C library's list for this thread: it must use no robust mutex.
     """
     number = _SET_ROBUST_LIST.get(platform.machine())
     if number is None:

@@ -1,15 +1,19 @@
-"""A robot whose bus is `mtls`, with its authority and keys in a test's own folder."""
+"""A robot whose bus is `mtls`, its keys in a test's own folder, and strangers on that bus."""
 
 from __future__ import annotations
 
 import datetime as dt
+import json
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import zenoh
 
+from shared.bus.credentials import AUTHORITY
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.config.sections import BusSecurityConfig
 from tools.keys import authority, certificates
@@ -84,3 +88,34 @@ def give(
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.pem").write_bytes(issued.certificate)
     (folder / f"{name}.key").write_bytes(issued.key)
+
+
+def stranger(endpoints: Sequence[str], tls: dict[str, Any] | None = None) -> zenoh.Session:
+    """Open a session without any rule of ours: as somebody with a Zenoh of his own does."""
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/endpoints": list(endpoints),
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "open/return_conditions/connect_scouted": False,
+        **({"transport/link/tls": tls} if tls else {}),
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def identity(folder: Path, name: str, authority: Path | None = None) -> dict[str, Any]:
+    """Return Zenoh's settings with a name's certificate of a folder."""
+    certificate, key = str(folder / f"{name}.pem"), str(folder / f"{name}.key")
+    return {
+        "root_ca_certificate": str(authority or folder / AUTHORITY),
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": False,
+    }

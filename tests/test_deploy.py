@@ -42,11 +42,16 @@ def tried(system: Path) -> list[str]:
     return run(system, 'printf %s "$tried"').stdout.split()
 
 
-def test_the_package_names_the_pythons_that_the_lock_was_tried_with(system: Path) -> None:
+def test_the_package_names_the_pythons_and_extras_of_its_locks(system: Path) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = [c.rpartition(" ")[2] for c in project["classifiers"] if "Python :: 3." in c]
     assert sorted(named) == sorted(tried(system))
     assert project["requires-python"] == ">=3.11"
+    assert set(run(system, 'printf %s "$robot_extras"').stdout.split()) == ON_ROBOTS
+    words = [ROOT / "deploy" / "install", "--runtime", "usb", "sim"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=30)
+    assert done.returncode == 2
+    assert done.stderr == "deploy: sim: one of ros2 usb goes with --runtime\n"
 
 
 @pytest.mark.parametrize(
@@ -104,10 +109,6 @@ def test_without_a_python_uv_makes_the_environment(system: Path) -> None:
     assert "no Python of 3.14 3.13 3.12 3.11 with its venv module" in done.stderr
 
 
-def test_a_robots_extras_are_those_that_the_runtime_knows(system: Path) -> None:
-    assert set(run(system, 'printf %s "$robot_extras"').stdout.split()) == ON_ROBOTS
-
-
 def test_an_extra_is_added_by_its_own_lock_with_hashes(system: Path) -> None:
     program(system, "python", 'echo "$*"')
     (system / "bin").mkdir()
@@ -118,13 +119,6 @@ def test_an_extra_is_added_by_its_own_lock_with_hashes(system: Path) -> None:
     assert second.endswith(f"--requirement {ROOT}/requirements.usb.lock")
     assert "--require-hashes --only-binary :all: --no-deps" in first
     assert end == "added 0"
-
-
-def test_no_other_extra_goes_with_a_robots_environment() -> None:
-    words = [ROOT / "deploy" / "install", "--runtime", "usb", "sim"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=30)
-    assert done.returncode == 2
-    assert done.stderr == "deploy: sim: one of ros2 usb goes with --runtime\n"
 
 
 @pytest.mark.parametrize(

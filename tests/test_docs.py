@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.recorder import disk_guard, host_watch, snapshot
+from services.recorder import host_watch, snapshot
 from services.simulator.physics import posture
 from shared.bus.session import peers_of
 from shared.bus.topics import TOPICS
@@ -48,7 +48,6 @@ _ABROAD = {
 """Names in backticks that are other programs'."""
 _EQUATION = re.compile(r"docs/law\.md\s+((?:(?:,|\s+and)?\s*\(\d+\))+)")
 """One or several numbers of its equations: `docs/law.md (6) and (12)`."""
-
 
 _SUFFIXES = (".py", ".toml", ".c", ".js", ".json", ".sh", ".md", ".lock", ".rules", "")
 
@@ -146,9 +145,9 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
 @pytest.mark.parametrize(
     ("page", "text"),
     [
-        ("logs.md", f"| below {disk_guard.WARN:g} | warns in its log; again only once"),
-        ("logs.md", f"again only once {disk_guard.CALM:g} were free"),
-        ("logs.md", f"| {disk_guard.RESUME:g} and more, after that |"),
+        ("logs.md", f"| below {host_watch.WARN:g} | warns in its log; again only once"),
+        ("logs.md", f"again only once {host_watch.CALM:g} were free"),
+        ("logs.md", f"| {host_watch.RESUME:g} and more, after that |"),
         ("logs.md", f"the same factors of {host_watch.RUN_DIR_MIN_MIB} MiB"),
         ("logs.md", f"silent for {snapshot.SILENT_NS // NS_PER_S} s"),
         ("logs.md", " or ".join(f"`{row.name}`" for row in snapshot.STEADY[1:])),
@@ -170,13 +169,10 @@ def test_a_page_has_the_codes_figure(page: str, text: str) -> None:
     assert text in (DOCS / page).read_text(encoding="utf-8")
 
 
-def test_readme_links_every_page() -> None:
+def test_every_page_is_linked_and_every_file_and_anchor_on_it_exists() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     pages = {path.name for path in DOCS.glob("*.md")} - {"index.md"}
     assert {page for page in pages if f"(docs/{page}" not in readme} == set()
-
-
-def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:
     broken = []
     for path, text in _texts(".py", ".md", ".toml", ".sh"):
         for page, anchor in _PAGE.findall(text):
@@ -184,6 +180,13 @@ def test_every_reference_to_a_page_leads_to_a_page_and_an_anchor() -> None:
             if not target.exists() or (anchor and anchor not in _anchors(target)):
                 broken.append(f"{path.relative_to(ROOT)}: docs/{page}#{anchor}")
     assert broken == []
+    missing = [
+        f"{page.relative_to(ROOT)}: {name}"
+        for page, text in _pages()
+        for name in _PATH.findall(text)
+        if not (ROOT / name).exists()
+    ]
+    assert missing == []
 
 
 def _functions_in_code() -> dict[str, set[int]]:
@@ -220,16 +223,6 @@ def test_each_equation_of_the_law_names_its_function_and_that_function_names_it(
         assert callable(pkgutil.resolve_name(function)), function
         named.setdefault(function, set()).add(int(number))
     assert _functions_in_code() == named
-
-
-def test_every_file_that_a_page_names_exists() -> None:
-    missing = [
-        f"{page.relative_to(ROOT)}: {name}"
-        for page, text in _pages()
-        for name in _PATH.findall(text)
-        if not (ROOT / name).exists()
-    ]
-    assert missing == []
 
 
 _STRINGS = re.compile(
@@ -287,3 +280,28 @@ def test_the_pages_build_without_a_warning(tmp_path: Path) -> None:
     page = (tmp_path / "law.html").read_text(encoding="utf-8")
     sources = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="(https?:[^"]+)"', page)
     assert sources == [], "the page must open without a network"
+
+
+TEXT = (ROOT / "docs" / "hazards.md").read_text(encoding="utf-8")
+CITED = sorted(set(re.findall(r"`(tests/[^`]+)`", TEXT)))
+
+
+def test_hazards_name_tests_only_where_they_are_closed() -> None:
+    kinds = re.findall(r"^## (.+)$", TEXT, flags=re.MULTILINE)
+    assert [kind.split(",")[0] for kind in kinds] == [
+        "It falls",
+        "It moves unasked",
+        "It sinks unasked",
+        "It pinches",
+        "It cannot be stopped",
+    ]
+    rows = [line.split("|") for line in TEXT.splitlines() if "**Open**" in line]
+    assert rows
+    assert all("tests/" not in row[3] for row in rows)
+
+
+@pytest.mark.parametrize("cited", CITED)
+def test_a_test_that_is_named_is_there(cited: str) -> None:
+    file, _, name = cited.partition("::")
+    assert (ROOT / file).is_file()
+    assert not name or f"def {name}(" in (ROOT / file).read_text(encoding="utf-8")

@@ -67,6 +67,11 @@ def test_the_lqr_leads_in_the_planners_place_and_the_robot_stands_when_it_is_kil
     assert "states, age 4." in lines[1]
 
 
+def test_the_gymnasium_environment_passes_its_checker_and_the_shipped_law_stands() -> None:
+    pytest.importorskip("gymnasium")
+    assert lines_of("gym_environment.py")[0].endswith("stood")
+
+
 def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
     shipped, gentle = (line.split() for line in lines_of("own_operator.py"))
     force, height = 2, 8

@@ -16,16 +16,16 @@ from tools.dev.mutants import (
     FILE,
     ROOT,
     Group,
-    GroupResult,
     MutantsFile,
     Mutation,
     Reason,
-    change_of,
+    _change_of,
+    _GroupResult,
 )
 from tools.terminal import Console
 
-DIFF = """--- services/joint/torque_limiter.py
-+++ services/joint/torque_limiter.py
+DIFF = """--- services/joint/differential.py
++++ services/joint/differential.py
 @@ -1,5 +1,5 @@
  def _soft_stop(q: float, stops: Pair) -> float:
 -    if q < stops[0]:
@@ -33,7 +33,7 @@ DIFF = """--- services/joint/torque_limiter.py
          return STIFFNESS * (stops[0] - q)
 """
 LIVES = Mutation(
-    "services.joint.torque_limiter.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:"
+    "services.joint.differential.x__soft_stop", "if q < stops[0]:", "if q <= stops[0]:"
 )
 WHY = "at the stop itself the spring pulls by nothing"
 
@@ -65,36 +65,30 @@ def test_each_mutant_that_may_live_is_of_a_function_that_is_there(told: MutantsF
 
 
 def test_a_mutant_is_known_by_its_function_and_its_lines() -> None:
-    assert change_of("services.joint.torque_limiter.x__soft_stop__mutmut_1", DIFF) == LIVES
+    assert _change_of("services.joint.differential.x__soft_stop__mutmut_1", DIFF) == LIVES
 
 
 def judged(alive: int, listed: tuple[Mutation, ...], **asked: object) -> tuple[int, str]:
     """Return exit code and words for 100 mutants of which some live, each by the same change."""
-    found = GroupResult(Counter(killed=100 - alive, survived=alive), [("one", LIVES)] * alive)
+    found = _GroupResult(Counter(killed=100 - alive, survived=alive), [("one", LIVES)] * alive)
     told = MutantsFile(
         group=(Group(name="a", modules=(), tests=()),),
         reason=(Reason(why=WHY, lives=listed),) if listed else (),
     )
-    flags = {"only": None, "sample": False, "survivors": False, "group": None}
+    flags = {"sample": False, "group": None}
     console = Console(record=True, width=200)
     code = mutants._judge([found], told, argparse.Namespace(**(flags | asked)), console)
     return code, console.export_text()
 
 
-def test_one_that_lives_for_no_reason_is_an_error_and_shown() -> None:
+def test_a_mutant_lives_only_for_a_reason_and_at_most_one_in_twenty_do() -> None:
     code, text = judged(1, ())
     assert code == 3
     assert "if q <= stops[0]:" in text
     assert "99 of 100 mutants fail a test (99.0%)" in text
-
-
-def test_those_with_a_reason_may_live_up_to_one_in_twenty() -> None:
     assert judged(5, (LIVES,))[0] == 0
     code, text = judged(6, (LIVES,))
     assert (code, "at least 95%" in text) == (3, True)
-
-
-def test_a_listed_mutant_that_dies_is_reported_when_all_ran() -> None:
     code, text = judged(0, (LIVES,))
     assert (code, "listed, and does not live" in text) == (3, True)
     assert judged(0, (LIVES,), sample=True)[0] == 0

@@ -58,16 +58,13 @@ def sources(*folders: str) -> list[Path]:
     return [path for path in found if "__pycache__" not in path.parts]
 
 
-def test_the_wheel_holds_every_file_of_the_packages_as_it_is(wheel: Path) -> None:
+def test_the_wheel_holds_packages_data_and_commit(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         for path in sources(*PACKAGES):
             name = path.relative_to(CHECKOUT).as_posix()
             held = name in archive.namelist()
             assert held != name.startswith(LEFT_OUT), name
             assert not held or archive.read(name) == path.read_bytes()
-
-
-def test_the_wheel_holds_every_data_file_of_deploy(wheel: Path) -> None:
     data = [path for path in sources("deploy") if path.suffix in (".toml", ".json", ".rules")]
     with zipfile.ZipFile(wheel) as archive:
         for path in data:
@@ -75,9 +72,6 @@ def test_the_wheel_holds_every_data_file_of_deploy(wheel: Path) -> None:
                 name = f"shared/files/{path.relative_to(CHECKOUT / 'deploy').as_posix()}"
                 assert archive.read(name) == path.read_bytes()
     assert len(data) > 10
-
-
-def test_the_wheel_says_which_commit_it_was_built_from(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         assert json.loads(archive.read(revision.BUILT_FROM)) == revision.code(CHECKOUT)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
-import importlib.metadata
 import itertools
 import os
 import re
@@ -26,7 +25,7 @@ from shared.exceptions import (
 )
 from tools.guarded_streams import guarded_streams
 from tools.keyboard import is_hung_up
-from tools.verb_table import NOUNS, RENAMED, VERBS, Subparsers, add_declared, sentence
+from tools.verb_table import NOUNS, PERSONS, VERBS, Subparsers, add_declared, sentence
 
 INTERRUPTED = 128 + signal.SIGINT
 _NEGATIVE_LIST = re.compile(r"-\.?\d[^,]*,")
@@ -105,16 +104,18 @@ def _drop_output() -> None:
 
 
 class _TopParser(FlagParser):
-    """Its help is one screen: a line for each verb of every day, then for each noun."""
+    """Its help fits on one screen: two verbs or nouns a line, by who needs them."""
 
     def format_help(self) -> str:
-        """Return it."""
-        daily = {verb.name: verb.help for verb in itertools.takewhile(lambda v: not v.noun, VERBS)}
-        others = {noun: text for noun, text in NOUNS.items() if " " not in noun}
-        others |= {v.name: v.help for v in VERBS if not v.noun and v.name not in daily}
-        lines = [f"  {name:<11}{text}" for name, text in daily.items()]
-        lines += ["", *(f"  {name:<11}{text}" for name, text in others.items())]
-        return "\n".join([f"{self.format_usage()}{self.description}", "", *lines, ""])
+        """Return the help."""
+        about = {verb.name: verb.help for verb in VERBS} | NOUNS
+        lines = [f"{self.format_usage()}{self.description}"]
+        for purpose, words in PERSONS.items():
+            entries = [f"  {name:<11}{about[name]:<36}" for name in words.split() if name in about]
+            half = (len(entries) + 1) // 2
+            columns = itertools.zip_longest(entries[:half], entries[half:], fillvalue="")
+            lines += ["", f"{purpose}:", *("".join(row).rstrip() for row in columns)]
+        return "\n".join([*lines, ""])
 
 
 def whole_parser() -> argparse.ArgumentParser:
@@ -173,11 +174,9 @@ def _asked(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> str:
 
 
 def _refuse(parser: argparse.ArgumentParser, noun: str, word: str, begin: str) -> None:
-    if not noun and word in RENAMED:
-        parser.exit(XrlError.exit_code, f"xrl: `xrl {word}` is `xrl {RENAMED[word]}` now\n")
     known = {verb.word: verb.name for verb in VERBS if verb.noun == noun}
     if not noun:
-        known |= {name: name for name in NOUNS if " " not in name} | RENAMED
+        known |= {name: name for name in NOUNS if " " not in name}
     near = dict.fromkeys(known[name] for name in difflib.get_close_matches(word, known, n=3))
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     if begin.startswith("-"):
@@ -193,6 +192,8 @@ class _Version(argparse.Action):
         super().__init__(option_strings, dest, nargs=0, **options)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        import importlib.metadata  # noqa: PLC0415 - costs every other verb 20 ms
+
         words = revision.in_words(revision.code())
         print(f"xrl {importlib.metadata.version('xrl')} ({words})")
         parser.exit()

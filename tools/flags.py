@@ -14,9 +14,13 @@ are in `check`.
 from __future__ import annotations
 
 import argparse
+import ast
 import dataclasses
 import functools
+import inspect
+import itertools
 import math
+import textwrap
 import types
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -38,11 +42,11 @@ from shared import places
 from shared.joints import MODULES
 from shared.run_directory import check_own, default_run_dir, own_directory
 from shared.toml_file import Range
-from tools.field_docs import field_docs
 
 F = TypeVar("F", bound="Flags")
 
 FINITE_MAX: Final = 1e12
+_OUR_PACKAGES: Final = ("shared", "services", "tools", "tests")
 
 Number = Annotated[float, Range(-FINITE_MAX, FINITE_MAX, "")]
 Seconds = Annotated[float, Range(0.0, FINITE_MAX, "s")]
@@ -82,7 +86,9 @@ class Arg(NamedTuple):
     is_one: bool = False
     """One word gives the whole tuple."""
     exclusive: str = ""
-    """Flags of the same word here exclude each other; one that ends with `!` needs one of them."""
+    """Flags of the same word here exclude each other."""
+    one_of: str = ""
+    """Exactly one flag of those with the same word here is required."""
     group: str = ""
     """Heading in the help; further lines describe what follows."""
     help: str = ""
@@ -188,6 +194,32 @@ def fields_of(declaration: type[Flags]) -> Iterator[_Field]:
         yield _Field(name, kind, limits, arg, text, is_repeated, is_required, field.default)
 
 
+def field_docs(struct: type) -> dict[str, str]:
+    """Return the docstring below each field in one line, those of base classes included."""
+    docs: dict[str, str] = {}
+    for owner in reversed(struct.__mro__):
+        if owner.__module__.partition(".")[0] in _OUR_PACKAGES:
+            docs |= _own_docs(owner)
+    return docs
+
+
+@functools.cache
+def _own_docs(struct: type) -> dict[str, str]:
+    tree = ast.parse(textwrap.dedent(inspect.getsource(struct)))
+    (body,) = (node.body for node in tree.body if isinstance(node, ast.ClassDef))
+    docs = {}
+    for field, below in itertools.pairwise(body):
+        if isinstance(field, ast.AnnAssign):
+            target: ast.expr = field.target
+        elif isinstance(field, ast.Assign):  # a member of an enumeration
+            target = field.targets[0]
+        else:
+            continue
+        if isinstance(target, ast.Name) and isinstance(below, ast.Expr):
+            docs[target.id] = " ".join(ast.literal_eval(below.value).split())
+    return docs
+
+
 def _taken_apart(hint: Any) -> tuple[Any, Range | None, Arg, bool]:
     limits, arg, is_repeated = None, Arg(), False
     while True:
@@ -223,11 +255,11 @@ def add_flags(parser: argparse.ArgumentParser, declaration: type[Flags]) -> None
         if arg.group not in groups:
             groups[arg.group] = parser.add_argument_group(*arg.group.split("\n", 1))
         where = groups[arg.group]
-        if arg.exclusive:
-            if arg.exclusive not in exclusive:
-                needed = arg.exclusive.endswith("!")
-                exclusive[arg.exclusive] = where.add_mutually_exclusive_group(required=needed)
-            where = exclusive[arg.exclusive]
+        if word := arg.exclusive or arg.one_of:
+            if word not in exclusive:
+                needed = bool(arg.one_of)
+                exclusive[word] = where.add_mutually_exclusive_group(required=needed)
+            where = exclusive[word]
         names = [field.name] if arg.is_positional else list(arg.names or [_flag(field.name)])
         where.add_argument(*names, **_argument(field))
 

@@ -68,52 +68,51 @@ class Verb(NamedTuple):
 
 
 NOUNS: Final = {
-    "drive": "set up, move and measure drives, joints and harness",
+    "drive": "set up, move and measure drives",
     "drive can": "bring the CAN buses up, listen to them, measure how fast drives answer",
-    "drive identify": "measure what the robot file assumes: masses, zeros, friction, scale",
-    "log": "inspect, export, play and re-execute records",
+    "log": "inspect, export, replay records",
     "topic": "show what is on the bus",
-    "study": "run many cases in virtual time, or crashes live: who falls, and why",
-    "hosts": "run services on several hosts: install, check, start, watch, stop",
-    "keys": "make, pack, check, renew and revoke the keys of the processes",
+    "study": "run many cases: who falls, and why",
+    "hosts": "run the services on several hosts",
+    "keys": "make, check and renew certificates",
     "ros2": "check what ROS 2 sees of the robot",
 }
-"""What the verbs of a noun are about; that of `bench` is a verb itself."""
+"""Subject of a noun's verbs; `bench` is also a verb itself."""
+
+PERSONS: Final = {
+    "To run a robot": (
+        "new doctor up down status start kill estop rearm pendant lead view faults drive log topic "
+        "hosts keys ros2"
+    ),
+    "To study it": "demo sim inject study gains",
+    "To develop it": "bench completion",
+}
+"""Verbs and nouns of `xrl --help`, by who needs them."""
 
 VERBS: Final = (
-    Verb("demo", "run the reference experiment, kill the planner, judge the outcome"),
-    Verb("sim", "run the same experiment in virtual time, with a modelled network"),
+    Verb("demo", "run the reference experiment, live"),
+    Verb("sim", "run an experiment in virtual time"),
     Verb("up", "start the fleet"),
-    Verb("down", "stop the fleet and leave nothing behind"),
-    Verb("status", "show services and modules, or processes and topics"),
-    Verb("start", "start a service that is down, or continue one that is paused", "services:start"),
+    Verb("down", "stop the fleet and lower the robot"),
+    Verb("status", "show services, modules and topics"),
+    Verb("start", "start or continue one service", "services:start"),
     Verb("kill", "send a signal to one service", "services:kill"),
-    Verb("inject", "delay, drop or cut a live fleet's messages for a while"),
-    Verb("estop", "stop every module: a slow sink, never a drop"),
-    Verb("rearm", "arm all six modules again after an emergency stop, or none", "services:rearm"),
-    Verb("pendant", "hold a dead man's handle: silent, it stops this host's modules"),
-    Verb("lead", "lead height, pitch and assist by a gamepad or by keys"),
-    Verb("view", "show the robot in a browser: live, recorded, or to lead and push"),
-    Verb("new", "make a robot's own directory: robot file, gains, scenarios, plants"),
-    Verb("doctor", "check drives, buses and computer against the robot file"),
-    Verb("faults", "list the faults: what the robot does, and how to recover"),
+    Verb("inject", "delay, drop or cut live messages"),
+    Verb("estop", "stop every module: the robot sinks", "estop:estop"),
+    Verb("rearm", "arm all modules again after a stop", "services:rearm"),
+    Verb("pendant", "hold a dead man's handle", "estop:pendant"),
+    Verb("lead", "lead by a gamepad or by keys"),
+    Verb("view", "show the robot in a browser"),
+    Verb("new", "make a robot's own directory"),
+    Verb("doctor", "check drives, buses and computer"),
+    Verb("faults", "list faults and how to recover"),
     Verb("drive configure", "write the drives' settings, after a backup; calibrate them"),
     Verb("drive zero", "write each joint's position to its drive"),
     Verb("drive jog", "move one joint of one module a little and judge the response"),
     Verb("drive tare", "set the harness's zero from its unloaded reading"),
     Verb("drive can setup", "bring the kernel's CAN interfaces up", "drive.can:set_up"),
     Verb("drive can test", "listen and count what each drive and sensor sends", "drive.can:test"),
-    Verb("drive can latency", "measure how long each axis takes to answer", "drive.can:latency"),
-    Verb(
-        "drive identify body",
-        "standing: payload and its centre, harness point, torque constant, encoder zeros",
-        "drive.identify:body",
-    ),
-    Verb(
-        "drive identify joint",
-        "hanging, its services down: dry and viscous friction, reflected inertia",
-        "drive.identify:joint",
-    ),
+    Verb("drive identify", "measure a hanging joint's friction and reflected inertia"),
     Verb("log info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("log recover", "make a complete log from one that was cut off"),
     Verb("log play", "put a log back onto a bus of its own, under replay/"),
@@ -153,33 +152,14 @@ VERBS: Final = (
     Verb("keys check", "check this host's keys", "keys:check"),
     Verb("keys renew", "make new certificates; the old ones stay valid", "keys:renew"),
     Verb("keys revoke", "make certificates of the next generation, for lost ones", "keys:revoke"),
-    Verb("gains", "compute a robot's certified gain schedule, or how stiff it must be"),
+    Verb("gains", "compute the certified gains"),
     Verb("ros2 check", "join the network as a node, and look for the robot and its topics"),
-    Verb("bench", "measure what each part of the fleet costs here, warm and cold"),
+    Verb("bench", "measure what each part costs here"),
     Verb("bench bus", "measure the fleet's message pattern over each transport", "bench:bus"),
     Verb("bench fleet", "measure the whole fleet, live, in the experiment", "bench:fleet"),
-    Verb("completion", "print the completion script for a shell"),
+    Verb("completion", "print a shell's completion script"),
 )
 """A verb's module is imported only when the verb is used."""
-
-RENAMED: Final = {
-    "top": "status --watch --traffic",
-    "assist": "lead --assist",
-    "stiffness": "gains --stiffness",
-    "hz": "topic hz",
-    "echo": "topic echo",
-    "sweep": "study",
-    "crashtest": "study crash",
-    **{
-        word: f"{noun} {word}"
-        for noun, words in (
-            ("drive", "configure zero jog tare can identify"),
-            ("log", "info recover join play report export explain resim whatif"),
-        )
-        for word in words.split()
-    },
-}
-"""Old names and what answers now."""
 
 
 def sentence(text: str) -> str:

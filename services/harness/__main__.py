@@ -6,14 +6,13 @@ import os
 from pathlib import Path
 
 from services.harness.filter import WrenchFilter
-from services.harness.loop import HarnessLoop
-from services.harness.zero_file import ZeroFile
+from services.harness.loop import HarnessLoop, ZeroFile
 from shared import process
 from shared.bus import topics
 from shared.bus.messages import TareRequest, Wrench
 from shared.bus.session import Session
 from shared.can.can_sensor import sensor_of
-from shared.can.loadcell_can import SampleAssembler
+from shared.can.sensor_frames import SampleAssembler
 from shared.can.sensor_service import SensorService, serve
 from shared.config.robot_config import RobotConfig
 from shared.run_directory import FLEET_VARIABLE

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shared.bus.messages import Tare, Vector6
-from shared.can.loadcell_can import as_sent
+from shared.can.sensor_frames import as_sent
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import HarnessConfig
 from shared.robot.stewart import N_LEGS, geometry_matrix

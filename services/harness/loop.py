@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
 from services.harness.filter import FilterState, WrenchFilter, start_tare, tared_state
-from services.harness.zero_file import ZeroFile
+from shared.arrays import Array
 from shared.bus.messages import Tare, TareRequest, Vector6, Wrench
 from shared.bus.ports import Inbox, Outbox
 from shared.can.sensor_loop import Sensor, SensorLoop
+from shared.robot.stewart import N_LEGS
+from shared.run_directory import live_dir, mapped
 
 
 class HarnessLoop(SensorLoop[Vector6, Wrench]):
@@ -54,3 +63,42 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
             tare=int(self.state.tare),
             age_ns=reading.age_ns,
         )
+
+
+_KEPT: Final = struct.Struct(f"<{N_LEGS}dI")
+"""The leg forces, N, and a checksum of this boot and them: a kill may come amid a write."""
+_BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
+
+
+def zero_path(run_dir: Path) -> Path:
+    """Return where the zero is kept."""
+    return live_dir(run_dir) / "harness.zero"
+
+
+class ZeroFile:
+    """The last zero of this fleet's harness."""
+
+    def __init__(self, run_dir: Path, boot: bytes | None = None) -> None:
+        """Open it, or make it; the directory is there. `boot` stands for this boot of the host.
+
+        Raises:
+            FleetError: it cannot be made.
+        """
+        self._memory = mapped(zero_path(run_dir), _KEPT.size)
+        self._boot = _BOOT.read_bytes() if boot is None else boot
+
+    def read(self) -> Array | None:
+        """Return the leg forces (6,) that count as zero, N; None: nothing has been tared."""
+        *forces, checksum = _KEPT.unpack(self._memory[:])
+        offset = np.array(forces)
+        return offset if checksum == self._checksum(offset) else None
+
+    def write(self, offset: Array | None) -> None:
+        """Keep a zero (6,), N; None: a tare that was asked for is not done."""
+        if offset is None:
+            self._memory[:] = bytes(_KEPT.size)
+        else:
+            self._memory[:] = _KEPT.pack(*offset.tolist(), self._checksum(offset))
+
+    def _checksum(self, offset: Array) -> int:
+        return zlib.crc32(self._boot + offset.tobytes())

@@ -11,7 +11,7 @@ from shared.bus import topics
 from shared.bus.messages import Attitude
 from shared.bus.session import Session
 from shared.can.can_sensor import sensor_of
-from shared.can.imu_can import ImuAssembler
+from shared.can.sensor_frames import ImuAssembler
 from shared.can.sensor_service import SensorService, serve
 from shared.config.robot_config import RobotConfig
 

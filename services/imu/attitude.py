@@ -15,7 +15,7 @@ import math
 from typing import Final, NamedTuple
 
 from shared.bus.messages import Vector3, Vector4
-from shared.can.imu_can import ImuSample
+from shared.can.sensor_frames import ImuSample
 from shared.clock import NS_PER_MS
 from shared.config.sections import ImuConfig
 from shared.robot.frames import rotated, torso_rotation

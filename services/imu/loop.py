@@ -5,7 +5,7 @@ from __future__ import annotations
 from services.imu.attitude import AttitudeLaw
 from shared.bus.messages import Attitude
 from shared.bus.ports import Outbox
-from shared.can.imu_can import ImuSample
+from shared.can.sensor_frames import ImuSample
 from shared.can.sensor_loop import Sensor, SensorLoop
 
 

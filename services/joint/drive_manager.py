@@ -12,14 +12,13 @@ from typing import Final
 
 import msgspec
 
-from services.joint.controller import ControllerSnapshot, CycleResult, JointController
+from services.joint.controller import ControllerState, CycleResult, JointController
 from services.joint.differential import motor_torque
-from services.joint.drive_fallback import DriveFallback
-from services.joint.drive_setpoint import DriveSetpointLaw
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drive_setpoint import DriveFallback, DriveGains, DriveSetpointLaw
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.rearm_guard import LastState
-from shared.bus.messages import LOST_DRIVE, Cause, JointCommand, JointEvent, Mode, Pair
+from shared.bus.messages import LOST_DRIVE, Cause, DriveStatus, JointCommand, JointEvent, Mode, Pair
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 
@@ -97,16 +96,32 @@ _NO_COMMAND, _TORQUE, _TARGET = DriveCommand.NOTHING, DriveCommand.TORQUE, Drive
 _NO_INHIBIT: Final = ArmingInhibit.NONE
 
 
-class DriveManagerState(msgspec.Struct, kw_only=True):
-    """State of `DriveManager`."""
+class Phase(Enum):
+    """What this service has to do with the drive's power."""
 
-    controller: ControllerSnapshot
-    gains: Pair
-    """`DriveSetpointLaw.gains`."""
+    NEW = 0
+    """It has not acted yet: if the drive is armed, another service armed it."""
+    HOLDING = 1
+    """The drive was found armed, and is not taken over yet."""
+    OURS = 2
+    """It has tried to arm the drive, or has taken it over."""
+
+
+_HOLDING, _OURS = Phase.HOLDING, Phase.OURS
+
+
+class DriveManagerState(msgspec.Struct, kw_only=True):
+    """All that changes from cycle to cycle in `DriveManager`."""
+
+    controller: ControllerState
+    gains: DriveGains = msgspec.field(default_factory=DriveGains)
+    """Gains that the drive has."""
+    phase: Phase = Phase.NEW
     estop: bool = False
     arm_at_ns: int = 0
     idle_at_ns: int = 0
     tries: int = 0
+    """Attempts to arm the drive; a take-over counts as one."""
     forgets: bool = False
     """The drive's zero is to be forgotten when its position is lost."""
     forget_at_ns: int = 0
@@ -119,16 +134,15 @@ class DriveManagerState(msgspec.Struct, kw_only=True):
     """End of flushing the link after a gap; 0: no gap."""
     last_state: LastState = LastState.NOTHING
     """For the next service, in case this one dies now."""
-    holding: bool = False
-    """True while a drive that was found armed has not been taken over."""
-    gains_changed_ns: int = 0
 
 
 class DriveManager:
     """One module's service between its drive and the bus.
 
     Attributes:
-        controller: the control law and its state.
+        controller: the control law.
+        state: all that changes from cycle to cycle. A snapshot is a copy of it
+            (`shared.state.copied`), and another manager that gets the copy continues bit for bit.
         bus: name of the module's CAN bus.
         onboard: True if the motors' own loops hold the module.
     """
@@ -146,32 +160,26 @@ class DriveManager:
             config.joint.gear_ratio, drive.vel_limit, drive.current_lim * drive.torque_constant
         )
         self._gear_ratio = config.joint.gear_ratio
-        self._state = DriveManagerState(
-            controller=self.controller.snapshot(),
-            gains=self._law.gains,
+        self.state = DriveManagerState(
+            controller=self.controller.start(),
             estop=last_state is LastState.DAMP,
             forgets=drive.zero_mark_turns > 0.0,
             last_state=last_state,
         )
 
     @property
-    def last_state(self) -> LastState:
-        """What the next service finds if this one dies now."""
-        return self._state.last_state
-
-    @property
     def needs_neighbours(self) -> bool:
         """True while the neighbours' states are used: in HOLD and DAMP."""
-        mode = self.controller.failsafe.mode
+        mode = self.state.controller.failsafe.mode
         return mode is _HOLD or mode is _DAMP
 
     @property
     def leaves_holding(self) -> bool:
         """True if the drive goes on holding by its own loop when the service ends now."""
-        s = self._state
-        mode, lost = self.controller.failsafe.mode, self.controller.cause is Cause.DRIVE_LOST
+        s = self.state
+        mode, lost = s.controller.failsafe.mode, s.controller.cause == Cause.DRIVE_LOST
         holds = mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP) or (mode is Mode.FAULT and lost)
-        return self.onboard and (holds or s.holding)
+        return self.onboard and (holds or s.phase is _HOLDING)
 
     def step(
         self,
@@ -182,73 +190,58 @@ class DriveManager:
         near: NeighbourView = UNKNOWN,
     ) -> DriveAction:
         """Run one cycle; arguments as for `JointController.step`; `estop` latches."""
-        s = self._state
+        s, controller = self.state, self.controller
         s.estop = s.estop or estop
-        if s.tries == 0 and reading is not None and reading.status is _ARMED:
+        if s.phase is not _OURS and reading is not None and reading.status is _ARMED:
             reading = self._found_armed(now_ns, reading)
         if s.last_cycle_ns and now_ns - s.last_cycle_ns > GAP_NS:
             s.listen_until_ns = now_ns + LISTEN_NS
         s.last_cycle_ns = now_ns
-        controller = self.controller
-        tau_before = controller.tau
+        tau_before = s.controller.tau
         estop = s.estop and not self._is_to_be_taken_over(reading)
-        flushing = s.listen_until_ns > 0
-        result = controller.step(now_ns, reading, command, estop, flushing=flushing, near=near)
-        mode = controller.failsafe.mode
+        flushes = s.listen_until_ns > 0
+        result = controller.step(
+            s.controller, now_ns, reading, command, estop, flushing=flushes, near=near
+        )
+        mode = s.controller.failsafe.mode
         if result.event is not None:
             s.last_state = self._new_last_state(mode)
-        if s.listen_until_ns:
-            if mode in _UNCONTROLLED:
-                s.listen_until_ns = 0
-            else:
-                result = self._resumed(now_ns, result, tau_before)
-                if now_ns < s.listen_until_ns or reading is None:
-                    return DriveAction(result.event, _NO_COMMAND, _NO_TORQUE, None, _NO_INHIBIT)
-                s.listen_until_ns = 0
-        if s.forgets and mode in _UNCONTROLLED and self._must_forget(now_ns):
-            return DriveAction(result.event, DriveCommand.CLEAR_ZERO, _NO_TORQUE, None, _NO_INHIBIT)
-        if mode is _DISARMED and now_ns >= s.arm_at_ns:
+        listens = False
+        if flushes and mode not in _UNCONTROLLED:
+            result = self._resumed(now_ns, result, tau_before)
+            listens = now_ns < s.listen_until_ns or reading is None
+        if not listens:
+            s.listen_until_ns = 0
+        out, torque, target, inhibit = _NO_COMMAND, _NO_TORQUE, None, None
+        if listens:
+            inhibit = _NO_INHIBIT
+        elif s.forgets and mode in _UNCONTROLLED and self._must_forget(now_ns):
+            out, inhibit = DriveCommand.CLEAR_ZERO, _NO_INHIBIT
+        elif mode is _DISARMED and now_ns >= s.arm_at_ns:
             inhibit = self._inhibit(now_ns, reading)
             if inhibit is not None:
-                command_out = _AT_ARMING.get(inhibit, _NO_COMMAND)
-                return DriveAction(result.event, command_out, _NO_TORQUE, None, inhibit)
-        command_out, torque, target = _NO_COMMAND, _NO_TORQUE, None
-        if mode is _FAULT:
-            command_out = self._in_fault(now_ns)
+                out = _AT_ARMING.get(inhibit, _NO_COMMAND)
+        if inhibit is not None:
+            pass
+        elif mode is _FAULT:
+            out = self._in_fault(now_ns)
         elif not self.onboard:
-            command_out, torque = _TORQUE, motor_torque(result.tau, self._gear_ratio)
+            out, torque = _TORQUE, motor_torque(result.tau, self._gear_ratio)
         elif mode is not _DISARMED:
-            samples = controller.samples
-            command_out = _TARGET
-            fallback_setpoint = self._fallback.law(controller.setpoint, mode)
-            target = self._law.target(
-                now_ns, fallback_setpoint, result.tau, samples.pos, samples.vel
+            out, estimate = _TARGET, s.controller.estimate
+            setpoint = self._fallback.law(s.controller.law.current, mode)
+            s.target = target = self._law.target(
+                s.gains, now_ns, setpoint, result.tau, estimate.pos, estimate.vel
             )
-            s.target = target
-        return DriveAction(result.event, command_out, torque, target, _NO_INHIBIT)
-
-    def snapshot(self) -> DriveManagerState:
-        """Return a copy of the state; `restore` continues from it."""
-        return msgspec.structs.replace(
-            self._state,
-            controller=self.controller.snapshot(),
-            gains=self._law.gains,
-            gains_changed_ns=self._law.changed_ns,
-        )
-
-    def restore(self, state: DriveManagerState) -> None:
-        """Continue from a copy of a state, bit for bit."""
-        self._state = msgspec.structs.replace(state)
-        self.controller.restore(state.controller)
-        self._law.gains, self._law.changed_ns = state.gains, state.gains_changed_ns
+        return DriveAction(result.event, out, torque, target, inhibit or _NO_INHIBIT)
 
     def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
         """Return the cycle's result with the torque that the drive carried without commands."""
-        s = self._state
-        samples, carried = self.controller.samples, tau_before
+        s = self.state
+        estimate, carried = s.controller.estimate, tau_before
         if s.target is not None:
-            carried = self._law.carried(s.target, samples.pos, samples.vel)
-        tau = self.controller.resume(now_ns, carried)
+            carried = self._law.carried(s.target, estimate.pos, estimate.vel)
+        tau = self.controller.resume(s.controller, now_ns, carried)
         event = result.event
         if event is not None:
             event = msgspec.structs.replace(event, tau_before=carried, tau_after=tau)
@@ -260,9 +253,9 @@ class DriveManager:
         A lost drive that may hold by its own loop gets no command: when the link comes back it
         still holds, unless one of its axes lost torque meanwhile. Any other drive goes idle.
         """
-        s = self._state
-        samples, cause = self.controller.samples, self.controller.cause
-        if cause is Cause.DRIVE_LOST and self.onboard and samples.status in _MAY_HOLD:
+        s = self.state
+        lost = s.controller.cause == Cause.DRIVE_LOST
+        if lost and self.onboard and s.controller.estimate.status in _MAY_HOLD:
             return DriveCommand.NOTHING
         if now_ns >= s.idle_at_ns:
             s.forget_at_ns = s.forget_at_ns or now_ns + FORGET_EVERY_NS
@@ -272,12 +265,12 @@ class DriveManager:
 
     def _must_forget(self, now_ns: int) -> bool:
         """Return True if an idle drive is to forget its zero now: it may lack turns."""
-        s, samples = self._state, self.controller.samples
-        if not samples.turns_lost or samples.status not in _NOT_ARMED or now_ns < s.forget_at_ns:
+        s, estimate = self.state, self.state.controller.estimate
+        if not estimate.turns_lost or estimate.status not in _NOT_ARMED or now_ns < s.forget_at_ns:
             return False
-        if s.forget_at_ns == 0 and self.controller.failsafe.mode is _FAULT:
+        if s.forget_at_ns == 0 and s.controller.failsafe.mode is _FAULT:
             return False  # it is not idle yet
-        if s.forgot and samples.status is DriveStatus.UNZEROED:
+        if s.forgot and estimate.status is DriveStatus.UNZEROED:
             return False
         s.forget_at_ns, s.forgot = now_ns + FORGET_EVERY_NS, True
         return True
@@ -291,15 +284,14 @@ class DriveManager:
         gains, rolled the torso, and the robot tipped while the hand led on. Without the onboard
         loop an armed drive is not ours.
         """
-        s = self._state
+        s = self.state
         if not self.onboard:
             return msgspec.structs.replace(reading, status=DriveStatus.IDLE)
-        failsafe, timing = self.controller.failsafe, self.controller.timing
-        led = s.estop or failsafe.is_fresh(now_ns, timing)
-        s.holding = reading.torque is None or not led
-        if s.holding:
+        led = s.estop or s.controller.failsafe.is_fresh(now_ns, self.controller.timing)
+        if reading.torque is None or not led:
+            s.phase = _HOLDING
             return msgspec.structs.replace(reading, status=DriveStatus.HOLDING)
-        s.tries = 1
+        s.phase, s.tries = _OURS, 1
         return reading
 
     def _is_to_be_taken_over(self, reading: DriveReading | None) -> bool:
@@ -307,20 +299,20 @@ class DriveManager:
 
         An emergency stop needs the drive's torque to start from.
         """
-        if not self.onboard or self.controller.failsafe.mode is not _DISARMED:
+        if not self.onboard or self.state.controller.failsafe.mode is not _DISARMED:
             return False
         return reading is None or reading.status in _MAY_HOLD
 
     def _new_last_state(self, mode: Mode) -> LastState:
         """Return the last state for the next service, in case this one dies now."""
-        s = self._state
+        s = self.state
         if mode is Mode.DISARMED:
             return s.last_state
         return LastState.DAMP if mode is Mode.DAMP or s.estop else LastState.HELD
 
     def _inhibit(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
         """Return what inhibits arming now; None if it is not known yet."""
-        s = self._state
+        s = self.state
         if reading is None or reading.status is DriveStatus.LOST:
             return None
         s.arm_at_ns = now_ns + ARM_EVERY_NS
@@ -328,19 +320,20 @@ class DriveManager:
             return ArmingInhibit.UNACKNOWLEDGED
         if reading.status is DriveStatus.HOLDING:
             return ArmingInhibit.WAITING if reading.torque is not None else None
-        s.holding = False
+        if s.phase is _HOLDING:
+            s.phase = Phase.NEW
         if reading.status is DriveStatus.UNZEROED:
             s.last_state = LastState.NOTHING  # zeroing it is a request to arm it
             return ArmingInhibit.UNZEROED
         if s.last_state is not LastState.NOTHING:
             return ArmingInhibit.LOST_TORQUE
-        if not self.controller.inside_limits():
+        if not self.controller.inside_limits(s.controller):
             return ArmingInhibit.OUTSIDE_LIMITS
-        if self.controller.samples.turns_lost:
+        if s.controller.estimate.turns_lost:
             return ArmingInhibit.UNZEROED
-        if self.controller.samples.moved:
+        if s.controller.estimate.moved:
             return None
-        s.tries += 1
+        s.phase, s.tries = _OURS, s.tries + 1
         if s.tries <= ARM_TRIES:
             failed = reading.status is DriveStatus.ERROR
             return ArmingInhibit.FAILED if failed else ArmingInhibit.NONE

@@ -16,12 +16,17 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import msgspec
+
+from services.joint import pd_law
 from services.joint.differential import joint_torque, motor_from_joint, motor_torque
 from services.joint.drivers.base import MotorTarget
 from services.joint.pd_law import Setpoint
-from shared.bus.messages import Pair
+from shared.bus.messages import Mode, Pair
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS
+from shared.config.robot_config import RobotConfig
+from shared.joints import kind_of
 
 GAIN_CHANGE: Final = 0.02
 """Relative change of the gains below which the drive keeps its old ones: the difference goes in as
@@ -37,13 +42,32 @@ INPUT_TORQUE_SHARE: Final = 0.75
 itself. A hip held with (900, 26) N m/rad has 463 on both motors, and from 0.25 rad off its
 reference the rest is more than the clamp lets through: its theta was 463 stiff instead of 26."""
 
+HOLD_SHARE: Final = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
+"""Fraction of the way from a drive's gains to HOLD's while its service leads.
+
+An ankle's gains rise to all of HOLD's. On TRACK's own, with at most 4 N m s/rad on its phi, a push
+from the side decayed by 0.72 each half swing with all six services dead, and 7 of 26 pairs of
+pushes in step with it fell. A knee's gains rise to a fifth of HOLD's. Without that, a knee whose
+service froze was soft while the other leg's was stiff, and the robot fell (450 mm); with 600 N
+m/rad it moves by 23 mm. With all of HOLD's gains the hand feels the drive's gains, which the
+service subtracts 2 ms late: 26 N in the squat instead of 18; with 600 N m/rad 19.8. A module whose
+phi alone is stiff keeps its gains: half of them is on its theta.
+"""
+
+
+class DriveGains(msgspec.Struct):
+    """Gains that the drive has."""
+
+    stiffness: float = 0.0
+    """N m a turn"""
+    damping: float = 0.0
+    """N m s a turn"""
+    changed_ns: int = 0
+    """Monotonic time of their last change; 0: none yet."""
+
 
 class DriveSetpointLaw:
-    """Makes the drive's targets; remembers the gains that the drive has.
-
-    Attributes:
-        changed_ns: monotonic time of their last change; 0: none yet.
-    """
+    """Makes the drive's targets."""
 
     def __init__(self, gear_ratio: float, vel_limit: float, torque_max: float = math.inf) -> None:
         """Take the gear ratio N, the drive's velocity limit, turn/s, and its torque limit, N m."""
@@ -51,25 +75,14 @@ class DriveSetpointLaw:
         self._gear_ratio = gear_ratio
         self._per_turn = 2.0 * math.pi / (4.0 * gear_ratio * gear_ratio)
         self._vel_limit = vel_limit
-        self._stiffness = 0.0
-        self._vel_gain = 0.0
-        self.changed_ns = 0
-
-    @property
-    def gains(self) -> Pair:
-        """Stiffness and damping that the drive has, N m and N m s a turn."""
-        return (self._stiffness, self._vel_gain)
-
-    @gains.setter
-    def gains(self, gains: Pair) -> None:
-        self._stiffness, self._vel_gain = gains
 
     def target(
-        self, now_ns: int, setpoint: Setpoint, tau: Pair, pos: Pair, vel: Pair
+        self, gains: DriveGains, now_ns: int, setpoint: Setpoint, tau: Pair, pos: Pair, vel: Pair
     ) -> MotorTarget:
         """Return the target under which the motors give the joint torques tau at this sample.
 
         Args:
+            gains: of the drive; they change rarely.
             now_ns: this module's monotonic clock.
             setpoint: the local law of this instant.
             tau: joint torques (phi, theta) for this sample, N m, after the limiter.
@@ -77,11 +90,11 @@ class DriveSetpointLaw:
             vel: motor velocities of the sample, turn/s.
         """
         s = setpoint
-        if now_ns - self.changed_ns >= GAIN_UPDATE_MIN_MS * NS_PER_MS or not self.changed_ns:
+        if now_ns - gains.changed_ns >= GAIN_UPDATE_MIN_MS * NS_PER_MS or not gains.changed_ns:
             stiffness, damping = s.k_p[0] + s.k_p[1], s.k_d[0] + s.k_d[1]
-            self._follow(now_ns, self._per_turn * stiffness, self._per_turn * damping)
-        vel_gain = self._vel_gain
-        pos_gain = self._stiffness / vel_gain if vel_gain > 0.0 else 0.0
+            _follow(gains, now_ns, self._per_turn * stiffness, self._per_turn * damping)
+        vel_gain = gains.damping
+        pos_gain = gains.stiffness / vel_gain if vel_gain > 0.0 else 0.0
         pos_ref = motor_from_joint(s.q_ref, self._gear_ratio)
         vel_ref = motor_from_joint(s.v_ref, self._gear_ratio)
         wanted = motor_torque(tau, self._gear_ratio)
@@ -119,10 +132,26 @@ class DriveSetpointLaw:
         )
         return joint_torque(motors, self._gear_ratio)
 
-    def _follow(self, now_ns: int, stiffness: float, damping: float) -> None:
-        """Take over gains that have changed by more than `GAIN_CHANGE`; N m and N m s a turn."""
-        damping = max(damping, stiffness / POS_GAIN_MAX)
-        if abs(stiffness - self._stiffness) > GAIN_CHANGE * self._stiffness:
-            self._stiffness, self.changed_ns = stiffness, now_ns
-        if abs(damping - self._vel_gain) > GAIN_CHANGE * self._vel_gain:
-            self._vel_gain, self.changed_ns = damping, now_ns
+
+def _follow(gains: DriveGains, now_ns: int, stiffness: float, damping: float) -> None:
+    """Adopt gains that have changed by more than `GAIN_CHANGE`; N m and N m s a turn."""
+    damping = max(damping, stiffness / POS_GAIN_MAX)
+    if abs(stiffness - gains.stiffness) > GAIN_CHANGE * gains.stiffness:
+        gains.stiffness, gains.changed_ns = stiffness, now_ns
+    if abs(damping - gains.damping) > GAIN_CHANGE * gains.damping:
+        gains.damping, gains.changed_ns = damping, now_ns
+
+
+class DriveFallback:
+    """Law with which a drive continues when its joint service dies."""
+
+    def __init__(self, config: RobotConfig, module: str) -> None:
+        """Take HOLD's gains."""
+        self._hold_k_p, self._hold_k_d = config.hold_gains(module)
+        self._share = HOLD_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
+
+    def law(self, setpoint: Setpoint, mode: Mode) -> Setpoint:
+        """Return the fallback for a setpoint. In DAMP a drive without commands goes on sinking."""
+        if self._share == 0.0 or mode is Mode.DAMP:
+            return setpoint
+        return pd_law.raise_gains(setpoint, self._hold_k_p, self._hold_k_d, self._share)

@@ -67,6 +67,11 @@ class HeatState(msgspec.Struct):
     shown: Pair = (0.0, 0.0)
     """Windings to a tenth, for the messages."""
 
+    @property
+    def kept(self) -> tuple[float, ...]:
+        """Numbers that a service that starts after this one needs, C and (N m)^2."""
+        return (*self.winding, *self.housing, *self.stage, *self.load)
+
 
 class _Motor(NamedTuple):
     """The two nodes as a linear system, but for the load."""
@@ -104,27 +109,30 @@ class HeatEstimate:
         self._stage_rise = heat.stage_per_square_ampere * per_torque2
         self._stage_s = heat.stage_s
         self._winding_max, self._stage_max = heat.winding_max, heat.stage_max
-        self.state = HeatState()
-        if self.enabled:
-            start: Pair = (heat.ambient, heat.ambient)
-            self.state = HeatState(winding=start, housing=start, stage=start)
+
+    def cold(self) -> HeatState:
+        """Return the state of a module that is as warm as the air."""
+        if not self.enabled:
+            return HeatState()
+        start: Pair = (self._motor.ambient, self._motor.ambient)
+        return HeatState(winding=start, housing=start, stage=start)
 
     def advance(
-        self, now_ns: int, motor_torque: Pair, fet: Pair | None, motor: Pair | None
+        self, s: HeatState, now_ns: int, motor_torque: Pair, fet: Pair | None, motor: Pair | None
     ) -> None:
-        """Take one cycle.
+        """Update the estimate with one cycle.
 
         Args:
+            s: the estimate, which changes.
             now_ns: this module's clock.
             motor_torque: of the two motors, N m.
             fet: what the drive reports of its output stages, C; None: nothing new.
             motor: what its motors' thermistors report, C; None: nothing new, or there are none.
         """
-        s = self.state
         a, b = motor_torque
         s.square = (s.square[0] + a * a, s.square[1] + b * b)
         s.cycles += 1
-        self.report(fet, motor)
+        report(s, fet, motor)
         if not s.stepped_ns:
             s.stepped_ns = now_ns
         elif now_ns - s.stepped_ns >= STEP_S * NS_PER_S:
@@ -137,57 +145,42 @@ class HeatEstimate:
                 s.load[0] + share * (mean[0] - s.load[0]),
                 s.load[1] + share * (mean[1] - s.load[1]),
             )
-            self._step(mean, dt_s)
-            self._show()
+            self._step(s, mean, dt_s)
+            self._show(s)
 
-    def keep(self) -> tuple[float, ...]:
-        """Return what a service that starts after this one needs, for `resume`; C and (N m)^2."""
-        s = self.state
-        return (*s.winding, *s.housing, *s.stage, *s.load)
-
-    def resume(self, kept: tuple[float, ...], passed_s: float) -> None:
+    def resume(self, s: HeatState, kept: tuple[float, ...], passed_s: float) -> None:
         """Start as warm as an earlier service left the module, cooled since.
 
         A drive may have held the robot meanwhile, by its own loop: the load goes on for `HOLDS_S`.
 
         Args:
-            kept: what `keep` returned.
+            s: the estimate, which changes.
+            kept: `HeatState.kept` of the earlier service.
             passed_s: time since then, s.
         """
         a, b, c, d, e, f, g, h = kept
-        s = self.state
         s.winding, s.housing, s.stage, s.load = (a, b), (c, d), (e, f), (g, h)
         held_s = min(passed_s, HOLDS_S)
-        self.skip(held_s)
+        self.skip(s, held_s)
         s.load = (0.0, 0.0)
-        self.skip(min(passed_s - held_s, COOLS_S))
+        self.skip(s, min(passed_s - held_s, COOLS_S))
         s.load = (g, h)
 
-    def skip(self, seconds: float) -> None:
+    def skip(self, s: HeatState, seconds: float) -> None:
         """Let time pass for the temperatures alone, under the present mean load (lockstep)."""
         while seconds > 0.0:
-            self._step(self.state.load, min(STEP_S, seconds))
+            self._step(s, s.load, min(STEP_S, seconds))
             seconds -= STEP_S
-        self._show()
+        self._show(s)
 
-    def _show(self) -> None:
-        s = self.state
-        s.left_s = round(min(self._left_s(0), self._left_s(1)), 1)
+    def _show(self, s: HeatState) -> None:
+        left_s = (min(self._stage_left_s(s, i), self._winding_left_s(s, i)) for i in (0, 1))
+        s.left_s = round(min(left_s), 1)
         s.shown = (round(s.winding[0], 1), round(s.winding[1], 1))
 
-    def report(self, fet: Pair | None, motor: Pair | None) -> None:
-        """Correct the estimate by what the drive reports, C; None: nothing new."""
-        s = self.state
-        if fet is not None:
-            s.stage = fet
-        if motor is not None:
-            (a, b), (c, d) = s.winding, s.housing
-            first, second = FOLLOW * (motor[0] - a), FOLLOW * (motor[1] - b)
-            s.winding, s.housing = (a + first, b + second), (c + first, d + second)
-
-    def _step(self, square: Pair, dt_s: float) -> None:
+    def _step(self, s: HeatState, square: Pair, dt_s: float) -> None:
         """Advance the temperatures under a mean squared torque, (N m)^2."""
-        s, m = self.state, self._motor
+        m = self._motor
         winding, housing, stage = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
         for i in (0, 1):
             hot, warm = s.winding[i], s.housing[i]
@@ -199,12 +192,8 @@ class HeatEstimate:
         s.winding, s.housing = (winding[0], winding[1]), (housing[0], housing[1])
         s.stage = (stage[0], stage[1])
 
-    def _left_s(self, i: int) -> float:
-        """Return the seconds until motor or output stage i is at its limit at the mean load."""
-        return min(self._stage_left_s(i), self._winding_left_s(i))
-
-    def _stage_left_s(self, i: int) -> float:
-        s, most = self.state, self._stage_max
+    def _stage_left_s(self, s: HeatState, i: int) -> float:
+        most = self._stage_max
         end = self._motor.ambient + self._stage_rise * s.load[i]
         if s.stage[i] >= most:
             return 0.0
@@ -213,14 +202,14 @@ class HeatEstimate:
         left_s = self._stage_s * math.log((end - s.stage[i]) / (end - most))
         return min(LEFT_MAX_S, left_s)
 
-    def _winding_left_s(self, i: int) -> float:
+    def _winding_left_s(self, s: HeatState, i: int) -> float:
         """Return when the winding crosses its limit, by the exact solution on a grid of times.
 
         With the resistance that rises the system stays linear:
 
             x' = A x + B, x = (T_w - T_a, T_h - T_a), A = [[h - e, e], [g, -g - l]]
         """
-        s, m = self.state, self._motor
+        m = self._motor
         hot, warm = s.winding[i] - m.ambient, s.housing[i] - m.ambient
         most = self._winding_max - m.ambient
         if hot >= most:
@@ -247,6 +236,16 @@ class HeatEstimate:
         return LEFT_MAX_S
 
 
+def report(s: HeatState, fet: Pair | None, motor: Pair | None) -> None:
+    """Correct an estimate by what the drive reports, C; None: nothing new."""
+    if fet is not None:
+        s.stage = fet
+    if motor is not None:
+        (a, b), (c, d) = s.winding, s.housing
+        first, second = FOLLOW * (motor[0] - a), FOLLOW * (motor[1] - b)
+        s.winding, s.housing = (a + first, b + second), (c + first, d + second)
+
+
 _KEPT: Final = struct.Struct("<q8d")
 _POSSIBLE: Final = (-60.0, 400.0)
 """C; a file with anything else is none."""
@@ -269,17 +268,16 @@ class HeatFile:
         self._memory = mapped(live_dir(run_dir) / f"{module}.heat", _KEPT.size)
         self._written_ns = 0
 
-    def restore(self, estimate: HeatEstimate, now_ns: int) -> None:
-        """Make an estimate go on from what the file holds, if it holds anything."""
+    def restore(self, estimate: HeatEstimate, s: HeatState, now_ns: int) -> None:
+        """Make an estimate's state go on from what the file holds, if it holds anything."""
         then_ns, *kept = _KEPT.unpack(self._memory[:])
         low, high = _POSSIBLE
         possible = all(low < one < high for one in kept) and min(kept[6:]) >= 0.0
         if then_ns > 0 and possible and estimate.enabled:
-            estimate.resume(tuple(kept), max(0, now_ns - then_ns) / NS_PER_S)
+            estimate.resume(s, tuple(kept), max(0, now_ns - then_ns) / NS_PER_S)
 
-    def write(self, estimate: HeatEstimate) -> None:
-        """Write what has changed since the last step of the estimate."""
-        stepped_ns = estimate.state.stepped_ns
-        if stepped_ns != self._written_ns:
-            self._written_ns = stepped_ns
-            self._memory[:] = _KEPT.pack(stepped_ns, *estimate.keep())
+    def write(self, s: HeatState) -> None:
+        """Write the state if the estimate has made a step since."""
+        if s.stepped_ns != self._written_ns:
+            self._written_ns = s.stepped_ns
+            self._memory[:] = _KEPT.pack(s.stepped_ns, *s.kept)

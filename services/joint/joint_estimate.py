@@ -5,6 +5,10 @@ a lost encoder until a heartbeat shows the error, and starts over, turns away, w
 restarted drive reports 0. Accepted for 40 ms, a knee at 0 was commanded -107 N m. So a sample that
 the joint cannot have reached is rejected, and after a few of them the position counts as lost. So
 it does when whole turns may be missing (`turn_watch`), also while the module is not controlled.
+
+A service that is held up reads two samples as one, or two within half a millisecond. By counting
+its cycles, it would from then on send its states a cycle apart from the other modules
+(`services.planner.state_phases`). So `SampleClock` counts the periods that have gone by.
 """
 
 from __future__ import annotations
@@ -14,10 +18,10 @@ from typing import Final
 import msgspec
 
 from services.joint.differential import joint_from_motor
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.failsafe import Event
 from services.joint.turn_watch import UNKNOWN, TurnWatch
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 
@@ -139,3 +143,40 @@ class JointEstimate(msgspec.Struct):
         first.moved = not armed and (first.moved or not first_can)
         second.moved = not armed and (second.moved or not second_can)
         return first_can and second_can
+
+
+FOLLOW_SHIFT = 3
+"""The clock follows a sample's time by an eighth: a single late sample counts as one."""
+
+
+class SampleClock(msgspec.Struct):
+    """Periods since the first sample.
+
+    Attributes:
+        count: of periods; 0 before the first.
+        before: the count at the sample before.
+    """
+
+    count: int = 0
+    before: int = 0
+    at_ns: int = 0
+    """When the present period began, smoothed."""
+
+    def advance(self, now_ns: int, period_ns: int) -> None:
+        """Take the time of a cycle, and the drive's period."""
+        self.before = self.count
+        if not self.count:
+            self.count, self.at_ns = 1, now_ns
+            return
+        since_ns = now_ns - self.at_ns
+        periods = max(0, (since_ns + period_ns // 2) // period_ns)
+        self.count += periods
+        self.at_ns += periods * period_ns
+        self.at_ns += (now_ns - self.at_ns) >> FOLLOW_SHIFT
+
+    def passed(self, every: int, phase: int) -> bool:
+        """Return True if a period phase, phase + every, ... began since the sample before.
+
+        With a sample lost, it is the next sample that passes it.
+        """
+        return (self.count - phase) // every > (self.before - phase) // every

@@ -20,14 +20,21 @@ from services.joint.drive_manager import (
     DriveCommand,
     DriveManager,
 )
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive
 from services.joint.heat import HeatFile
 from services.joint.neighbours import UNKNOWN, NeighbourRow, NeighbourView
-from services.joint.pendant import PendantWatch
-from services.joint.rearm_guard import PENDANT, LastState, RearmGuard
+from services.joint.rearm_guard import PENDANT, LastState, PendantWatch, RearmGuard
 from services.joint.tracer import Tracer
 from shared import log
-from shared.bus.messages import Cause, Estop, JointCommand, JointEvent, JointState, Mode
+from shared.bus.messages import (
+    Cause,
+    DriveStatus,
+    Estop,
+    JointCommand,
+    JointEvent,
+    JointState,
+    Mode,
+)
 from shared.bus.ports import CountingInbox, Inbox, Outbox
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S, now_ns
@@ -122,7 +129,7 @@ class JointLoop:
         self._drive, self._ports, self._clock = drive, ports, clock or now_ns
         self._heat_file = heat_file
         if heat_file is not None:
-            heat_file.restore(module.controller.heat, self._clock())
+            heat_file.restore(module.controller.heat, module.state.controller.heat, self._clock())
         self._tracer = None if ports.traces is None else Tracer(module)
         self._reported = ArmingInhibit.NONE
         self._report_at_ns = 0
@@ -158,29 +165,29 @@ class JointLoop:
         malformed = ports.commands.refused - self._malformed
         if malformed:
             self._malformed += malformed
-            module.controller.count_malformed(malformed, now)
+            module.state.controller.failsafe.count_malformed(malformed, now)
         ended = 0 if ports.planner is None else ports.planner.ended()
         if ended:
-            module.controller.end_session(ended)
+            module.state.controller.failsafe.end_session(ended)
         near = UNKNOWN
         if self._neighbours is not None and module.needs_neighbours:
             near = self._neighbours.view(now)
         step = module.step(now, reading, command, estop, near)
-        controller = module.controller
-        due = controller.is_state_due
-        if controller.states == 0:  # a module that cannot say where it is must not arm
-            self._has_sent, due = ports.states.put(controller.state(now)), False
+        controller, state = module.controller, module.state.controller
+        due = controller.is_state_due(state)
+        if state.states == 0:  # a module that cannot say where it is must not arm
+            self._has_sent, due = ports.states.put(controller.state(state, now)), False
         self._write(step)
         if self._neighbours is not None:
-            self._neighbours.write(row_of(controller, now))
+            self._neighbours.write(row_of(state, now))
         if step.event is not None:
             ports.events.put(step.event)
-        if due and ports.states.put(controller.state(now)):
+        if due and ports.states.put(controller.state(state, now)):
             self._has_sent = True
         if self._rearm_guard is not None:
-            self._rearm_guard.write(module.last_state)
+            self._rearm_guard.write(module.state.last_state)
         if self._heat_file is not None:
-            self._heat_file.write(controller.heat)
+            self._heat_file.write(state.heat)
         if tracer is not None and ports.traces is not None:
             trace = tracer.after(now, reading, command, estop, step, near, malformed, ended)
             if trace is not None:
@@ -219,7 +226,7 @@ class JointLoop:
         """Log what a person must know; the module is not controlled then, so a log line is safe."""
         if step.event is None and step.inhibit is ArmingInhibit.NONE:
             return
-        now, samples = self._clock(), self.module.controller.samples
+        now, samples = self._clock(), self.module.state.controller.estimate
         if step.event is not None and step.event.cause == Cause.ESTOP and self._pendant.lost:
             log.get("xrl").error("emergency stop: the pendant is silent")
         if step.event is not None and step.event.mode_after == Mode.FAULT:

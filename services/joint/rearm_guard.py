@@ -9,10 +9,16 @@ module (`xrl kill`, `xrl start`, `xrl up`) clears it.
 The second is the emergency stop of someone on the robot's own host (`xrl estop`). It works with the
 planner dead and every link of the bus cut, and holds until a person restarts the module.
 
-The third is the pendant's count of beats (`services.joint.pendant`), the fourth who engaged the
+The third is the pendant's count of beats (see below), the fourth who engaged the
 emergency stop that holds, however it came, for `xrl status`.
 
 The file is mapped: reading and writing it are loads and stores, which the control path may do.
+
+The pendant is a dead man's handle: all six modules stop when it falls silent. Whatever fails
+between the person's hand and the robot, a cable, a radio or a host, shows as silence. The pendant
+beats in each module's shared memory, without a bus. A pendant that was never there, or was laid
+down in order, is not missed. Silence is counted in cycles of the module, so a pause of the whole
+machine does not count.
 """
 
 from __future__ import annotations
@@ -28,6 +34,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from shared.clock import NS_PER_MS
 from shared.run_directory import live_dir, mapped
 
 _LAST_STATE, _STOP = range(2)
@@ -200,3 +207,38 @@ class Pendant:
         for memory in self._memories.values():
             # packing in place first writes zeros: for a reader there would be no pendant
             memory[_BEATS_AT : _BEATS_AT + _BEATS.size] = _BEATS.pack(beats)
+
+
+CYCLE_MAX_NS: Final = 20 * NS_PER_MS
+"""Most time between two cycles that counts as silence."""
+
+
+class PendantWatch:
+    """Listens to it, for one module.
+
+    Attributes:
+        lost: True while there is one that has been silent for too long.
+    """
+
+    def __init__(self, silent_ms: float) -> None:
+        """Take how long it may be silent."""
+        self._silent_ns = round(silent_ms * NS_PER_MS)
+        self._beats = 0
+        self._last_ns = 0
+        self._silence_ns = 0
+        self.lost = False
+
+    def is_lost(self, now_ns: int, beats: int) -> bool:
+        """Take one cycle; return `lost`.
+
+        Args:
+            now_ns: this module's clock.
+            beats: `RearmGuard.beats`, in each cycle.
+        """
+        if beats == self._beats:
+            self._silence_ns += min(CYCLE_MAX_NS, now_ns - self._last_ns)
+        else:
+            self._beats, self._silence_ns = beats, 0
+        self._last_ns = now_ns
+        self.lost = beats > 0 and self._silence_ns > self._silent_ns
+        return self.lost

@@ -34,6 +34,11 @@ class SetpointState(msgspec.Struct, kw_only=True):
     """When it began to stiffen because another module may be limp; 0: it does not."""
     sinking: SinkingState
 
+    @property
+    def stays(self) -> bool:
+        """True in DAMP for a module that no longer sinks: caught, or stiffened for a limp one."""
+        return self.sinking.caught or self.sinking.held is not None
+
 
 class SetpointLaw:
     """Chooses and blends a module's setpoints."""
@@ -49,75 +54,74 @@ class SetpointLaw:
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self._blend_ns = service.blend_ms * NS_PER_MS
         self._stiffen_ns = service.stiffen_ms * NS_PER_MS
-        self.sinking = Sinking(config, module)
-        stand_here = pd_law.stand(pd_law.ZERO, self.stand_k_p, self.stand_k_d)
-        self.state = SetpointState(
-            frozen=stand_here, current=stand_here, sinking=self.sinking.state
-        )
+        self._sinking = Sinking(config, module)
 
-    @property
-    def stiffened(self) -> bool:
-        """True while it holds with all of its support gains."""
-        return self.state.stiffened_ns > 0
+    def at_rest(self) -> SetpointState:
+        """Return the state of a module that has not been armed yet: at the stand gains."""
+        here = pd_law.stand(pd_law.ZERO, self.stand_k_p, self.stand_k_d)
+        return SetpointState(frozen=here, current=here, sinking=self._sinking.start())
 
     def age_s(self, command: JointCommand, now_ns: int) -> float:
         """Return a command's age, s, as far as it is extrapolated: docs/law.md (22)."""
         return min(self._aging_max_s, (now_ns - command.echo_t_ns) / NS_PER_S)
 
-    def is_settled(self, now_ns: int) -> bool:
+    def is_settled(self, s: SetpointState, now_ns: int) -> bool:
         """Return True if the blend after the last change of mode is over."""
-        s = self.state
         return now_ns - s.changed_ns >= self._blend_ns
 
-    def start(self, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
+    def start(self, s: SetpointState, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
         """Start a mode from a given setpoint: until now the module was DISARMED."""
-        s = self.state
-        self._note_change(mode, now_ns)
+        _note_change(s, mode, now_ns)
         s.frozen = s.current = setpoint
 
-    def change(self, mode: Mode, now_ns: int, q: Pair) -> None:
+    def change(self, s: SetpointState, mode: Mode, now_ns: int, q: Pair) -> None:
         """Freeze the setpoint in force for a new mode.
 
         Args:
+            s: the setpoints, which change.
             mode: the new mode.
             now_ns: this module's monotonic clock.
             q: joint angles (phi, theta), rad.
         """
-        s = self.state
-        self._note_change(mode, now_ns)
+        _note_change(s, mode, now_ns)
         if mode is Mode.DAMP:
-            s.frozen = self.sinking.begin(s.current, q)
+            s.frozen = self._sinking.begin(s.sinking, s.current, q)
         elif mode is Mode.HOLD:
             s.frozen = pd_law.limit_stiffening(s.current, q, self._hold_k_p, self._hold_torque)
         else:
             s.frozen = s.current
 
     def evaluate(
-        self, now_ns: int, failsafe: Failsafe, q: Pair, near: NeighbourView = UNKNOWN
+        self,
+        s: SetpointState,
+        now_ns: int,
+        failsafe: Failsafe,
+        q: Pair,
+        near: NeighbourView = UNKNOWN,
     ) -> Setpoint:
         """Return the setpoint of this instant.
 
         Args:
+            s: the setpoints, which change.
             now_ns: this module's monotonic clock.
             failsafe: mode and newest command.
             q: joint angles (phi, theta), rad.
             near: what is known of the other modules on this host.
         """
-        s = self.state
         mode = failsafe.mode
         limp = near.stiffen and (mode is _HOLD or mode is _DAMP)
         if not s.stiffened_ns and (limp or failsafe.stiffen_requested):
             s.stiffened_ns = now_ns
             if mode is _HOLD:
-                self._bound_stiffening(now_ns, q)
+                self._bound_stiffening(s, now_ns, q)
         since_ns = now_ns - s.changed_ns
         if mode is _TRACK:
-            s.current = self._tracked(now_ns, failsafe.command, since_ns)
+            s.current = self._tracked(s, now_ns, failsafe.command, since_ns)
         elif mode is _DAMP:
             near = near._replace(stiffen=s.stiffened_ns > 0)
-            s.current = self.sinking.law(s.frozen, s.current, since_ns, q, near)
+            s.current = self._sinking.law(s.sinking, s.frozen, s.current, since_ns, q, near)
         else:
-            s.current = self._held(since_ns)
+            s.current = self._held(s, since_ns)
             if s.stiffened_ns:
                 risen = min(1.0, (now_ns - s.stiffened_ns) / self._stiffen_ns)
                 s.current = pd_law.raise_gains(
@@ -125,39 +129,35 @@ class SetpointLaw:
                 )
         return s.current
 
-    def restore(self, state: SetpointState) -> None:
-        """Continue from a state, which is this law's from now on."""
-        self.state, self.sinking.state = state, state.sinking
-
-    def _note_change(self, mode: Mode, now_ns: int) -> None:
-        s = self.state
-        s.changed_ns = now_ns
-        if mode is not Mode.DAMP:
-            s.stiffened_ns = 0
-
-    def _tracked(self, now_ns: int, command: JointCommand | None, since_ns: int) -> Setpoint:
+    def _tracked(
+        self, s: SetpointState, now_ns: int, command: JointCommand | None, since_ns: int
+    ) -> Setpoint:
         """Return the planner's setpoint now, blended in from HOLD's."""
         assert command is not None  # noqa: S101 - TRACK is entered on fresh commands only
         fresh = pd_law.extrapolate(command, self.age_s(command, now_ns))
         if since_ns >= self._blend_ns:
             return fresh
-        return pd_law.blend(self._held(since_ns), fresh, since_ns / self._blend_ns)
+        return pd_law.blend(self._held(s, since_ns), fresh, since_ns / self._blend_ns)
 
-    def _bound_stiffening(self, now_ns: int, q: Pair) -> None:
-        """Have no spring of HOLD pull too hard once it has risen to its support gain.
+    def _bound_stiffening(self, s: SetpointState, now_ns: int, q: Pair) -> None:
+        """Bound the torque that HOLD's springs add as they rise to their support gains.
 
         A hip whose theta is soft may be far from its reference: a hand has turned the torso.
         """
-        s = self.state
-        held = self._held(now_ns - s.changed_ns)
+        held = self._held(s, now_ns - s.changed_ns)
         near = pd_law.limit_stiffening(held, q, self._support_k_p, self._hold_torque)
         if near is not held:
             s.frozen, s.changed_ns = near, now_ns
 
-    def _held(self, since_ns: int) -> Setpoint:
+    def _held(self, s: SetpointState, since_ns: int) -> Setpoint:
         """Return HOLD's setpoint: frozen, and some gains rise to the stand gains."""
-        s = self.state
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._stiffen_ns)
         frozen = pd_law.freeze(s.frozen, moving)
         return pd_law.raise_gains(frozen, self._hold_k_p, self._hold_k_d, risen)
+
+
+def _note_change(s: SetpointState, mode: Mode, now_ns: int) -> None:
+    s.changed_ns = now_ns
+    if mode is not Mode.DAMP:
+        s.stiffened_ns = 0

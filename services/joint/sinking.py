@@ -86,11 +86,14 @@ class Sinking:
         self._blend_ns = service.blend_ms * NS_PER_MS
         self._stiffen_ns = service.stiffen_ms * NS_PER_MS
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
-        self.state = SinkingState(stop=service.damp_knee_stop if kind == "knee" else None)
+        self._stop = service.damp_knee_stop if kind == "knee" else None
 
-    def begin(self, setpoint: Setpoint, q: Pair) -> Setpoint:
+    def start(self) -> SinkingState:
+        """Return the state of a module that has never sunk."""
+        return SinkingState(stop=self._stop)
+
+    def begin(self, s: SinkingState, setpoint: Setpoint, q: Pair) -> Setpoint:
         """Return the setpoint that sinking starts from, at joint angles q (rad)."""
-        s = self.state
         if s.stop is not None:
             s.stop = min(s.stop, q[1])
         s.upright = s.held = s.below = s.ahead = None
@@ -99,6 +102,7 @@ class Sinking:
 
     def law(
         self,
+        s: SinkingState,
         frozen_setpoint: Setpoint,
         current: Setpoint,
         since_ns: int,
@@ -108,23 +112,23 @@ class Sinking:
         """Return the local law.
 
         Args:
+            s: state of the sinking, which changes.
             frozen_setpoint: the setpoint that `begin` returned.
             current: the setpoint in force until now.
             since_ns: time since then, ns.
             q: joint angles, rad.
             near: view of the other modules.
         """
-        s = self.state
         if near.stiffen and s.held is None:
             s.held, s.held_ns = self._carried(current, q), since_ns
         if s.held is not None:
             return self._stiffened(s.held, since_ns - s.held_ns)
-        holds = self._is_to_hold(since_ns, near)
+        holds = _is_to_hold(s, since_ns, near)
         sunk = self._sunk(frozen_setpoint, since_ns)
         if self._levels:
-            return self._levelled(sunk, q[1], near, min(1.0, since_ns / self._blend_ns))
+            return self._levelled(s, sunk, q[1], near, min(1.0, since_ns / self._blend_ns))
         if self._places:
-            return self._placed(sunk, q[1], near)
+            return self._placed(s, sunk, q[1], near)
         if s.stop is None:
             return sunk
         if holds and not s.caught:
@@ -154,20 +158,11 @@ class Sinking:
         stands = msgspec.structs.replace(stands, tau_ff=held.tau_ff)
         return pd_law.blend(start, stands, min(1.0, after_ns / self._stiffen_ns))
 
-    def _is_to_hold(self, since_ns: int, near: NeighbourView) -> bool:
-        s = self.state
-        if near.sinks:
-            s.doubt_ns = -1
-            return False
-        if s.doubt_ns < 0:
-            s.doubt_ns = since_ns
-        return since_ns - s.doubt_ns >= DOUBT_NS
-
     def _levelled(
-        self, sunk: Setpoint, theta: float, near: NeighbourView, risen: float
+        self, s: SinkingState, sunk: Setpoint, theta: float, near: NeighbourView, risen: float
     ) -> Setpoint:
         """Return the law of a hip; if its leg is no longer seen, the leg's last angle holds."""
-        s, rate = self.state, 0.0
+        rate = 0.0
         if near.leg is not None:
             s.below, rate = near.leg
         if s.below is None:
@@ -178,9 +173,11 @@ class Sinking:
         wanted = clamp(wanted, theta - LEVEL_MAX, theta + LEVEL_MAX)
         return pd_law.hold_theta(sunk, wanted, -rate, risen * self._k_p[1], sunk.k_d[1])
 
-    def _placed(self, sunk: Setpoint, theta: float, near: NeighbourView) -> Setpoint:
+    def _placed(
+        self, s: SinkingState, sunk: Setpoint, theta: float, near: NeighbourView
+    ) -> Setpoint:
         """Return the law of an ankle; if its knee is no longer seen, its last angle holds."""
-        s, rate = self.state, 0.0
+        rate = 0.0
         if near.leg is not None:
             knee, rate = near.leg
             s.below = clamp(knee, -math.pi, math.pi)  # the cosine of an infinity would raise
@@ -201,3 +198,12 @@ class Sinking:
         height = self._shank * math.cos(place) + up
         v_ref = -rate * up / height if height > LOW_M else 0.0
         return pd_law.hold_theta(sunk, wanted, v_ref, sunk.k_p[1], sunk.k_d[1])
+
+
+def _is_to_hold(s: SinkingState, since_ns: int, near: NeighbourView) -> bool:
+    if near.sinks:
+        s.doubt_ns = -1
+        return False
+    if s.doubt_ns < 0:
+        s.doubt_ns = since_ns
+    return since_ns - s.doubt_ns >= DOUBT_NS

@@ -65,7 +65,7 @@ class Tracer:
                 -1 if command is None else command.seq,
                 estop,
                 step.command.value,
-                self._module.controller.tau,
+                self._module.state.controller.tau,
                 near.leg or _NOTHING,
                 near.leg is not None,
                 near.sinks,
@@ -98,4 +98,4 @@ class Tracer:
     def _remember(self) -> None:
         """Take the snapshot if the next message carries it."""
         due = self._seq % SNAPSHOT_EVERY == 0
-        self._snapshot = self._encode(self._module.snapshot()).decode() if due else ""
+        self._snapshot = self._encode(self._module.state).decode() if due else ""

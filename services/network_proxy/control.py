@@ -1,4 +1,4 @@
-"""What is asked of the network proxy: requests in, carried out, answers out. Waits for nobody."""
+"""What is asked of the network proxy: requests in, carried out, answers out. Never blocks."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class CommandHandler:
 
 
 ASKERS_MAX: Final = 16
-"""Who asks at once; one more, and the one that came first has to go."""
+"""Maximum number of concurrent clients; the oldest is dropped."""
 _decode = msgspec.json.Decoder(Request).decode
 
 
@@ -143,7 +143,7 @@ class ControlSocket:
         watch.want(self._listener.socket, READ, self._dialled)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         for asker in list(self._askers):
             self._leave(asker)
         self._watch.want(self._listener.socket, 0, self._dialled)

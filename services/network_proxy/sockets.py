@@ -88,7 +88,7 @@ class SocketListener:
         self._keep_spare()
 
     def accept(self) -> socket.socket | None:
-        """Return the end of who has dialled; it does not block. None: nobody, or turned away."""
+        """Return the socket of a new client, or None if there is none or it was turned away."""
         try:
             end, _ = self.socket.accept()
         except OSError as error:
@@ -99,7 +99,7 @@ class SocketListener:
         return end
 
     def close(self) -> None:
-        """Listen no more, and remove the path."""
+        """Stop listening, and remove the path."""
         self.socket.close()
         self._path.unlink(missing_ok=True)
         self._give_spare()

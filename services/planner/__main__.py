@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 
-from services.planner.controller_file import controller_maker
+from services.planner.controller import controller_maker
 from services.planner.loop import PlannerLoop, PlannerPorts, requests_of
 from services.planner.planner import Planner
 from shared import log, planner_life, scheduling

@@ -26,7 +26,7 @@ class OperatorRequest(NamedTuple):
     source: str = ""
     """Name of the requester; "" if nobody requests anything, or the intent is stale."""
     sit: bool = False
-    """Go down by itself to the lowest pose (`services.planner.law.height`)."""
+    """Go down by itself to the lowest pose (`services.planner.law.closed_reference`)."""
 
 
 class Intents:

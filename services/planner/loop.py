@@ -83,7 +83,7 @@ class Checkpoints:
             t_ns=now_ns,
             seq=self._seq,
             session=planner.session,
-            snapshot=self._encode(planner.snapshot()).decode(),
+            snapshot=self._encode(planner.state).decode(),
         )
 
 

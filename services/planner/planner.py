@@ -7,7 +7,6 @@ log.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -16,21 +15,16 @@ import numpy as np
 from services.planner.controller import Controller, Observation
 from services.planner.intents import OperatorRequest
 from services.planner.law.assist import Overload, OverloadState, force_up
-from services.planner.law.height import Toward
-from services.planner.law.hocca import Hocca, LawOutput, LawState
+from services.planner.law.closed_reference import Toward
+from services.planner.law.hocca import Hocca, LawInputs, LawOutput, LawState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
-from services.planner.watch.engagement_fsm import Engagement
-from services.planner.watch.harness_trust import HarnessTrust
-from services.planner.watch.heat import HeatWatch, HeatWatchState
-from services.planner.watch.limp_leg_watch import LimpLegWatch
-from services.planner.watch.plausible import Plausible
-from services.planner.watch.rival_watch import RivalWatch
-from services.planner.watch.soles import Soles
-from services.planner.watch.supply import SupplyState, SupplyWatch
-from services.planner.watch.trips import PlannerTrips, TripsState, values_of
-from services.planner.watch.unattended import Unattended, UnattendedState
-from shared.arrays import Array
+from services.planner.watch.engagement_fsm import Engagement, LimpLegWatch, RivalWatch
+from services.planner.watch.plausible import HarnessTrust, Plausible
+from services.planner.watch.reserves import HeatWatch, HeatWatchState, SupplyState, SupplyWatch
+from services.planner.watch.trips import PlannerTrips, Soles, TripsState, values_of
+from services.planner.watch.unattended import Unattended
+from shared.arrays import Array, vector6
 from shared.bus.messages import (
     Attitude,
     JointCommand,
@@ -41,14 +35,12 @@ from shared.bus.messages import (
     SplitSource,
     Tare,
     Vector3,
-    Vector6,
     Wrench,
 )
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.joints import MODULES, N_JOINTS, N_MODULES
+from shared.joints import MODULES, N_MODULES
 from shared.robot.hold_rules import Support
-from shared.state import copied
 
 EARLY_FRACTION = 0.5
 """Fraction of a period; states that arrive sooner after a tick still belong to that tick."""
@@ -64,37 +56,62 @@ _WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
 
 
 class PlannerState(msgspec.Struct, kw_only=True):
-    """State of `Planner` between two ticks; one of six entries for each module."""
+    """All that changes in `Planner` from tick to tick; lists have one entry for each module."""
 
     states: list[JointState | None] = msgspec.field(default_factory=lambda: [None] * N_MODULES)
     arrived_ns: list[int] = msgspec.field(default_factory=lambda: [0] * N_MODULES)
+    new: int = 0
+    """Bit i: module i has a state that no tick has used."""
     wrench: Wrench | None = None
     wrench_ns: int = 0
-    wrench_seq: int = -1
+    attitude: Attitude | None = None
+    attitude_ns: int = 0
+    request: OperatorRequest = OperatorRequest()
+    refused: int = 0
+    """Implausible measurements so far."""
     last_ns: int = 0
     """Time of the last tick."""
     seq: int = 0
     source: SplitSource | None = None
     """Source of the gains of the last tick."""
+    rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
     engagement: Engagement = msgspec.field(default_factory=Engagement)
     overload: OverloadState = msgspec.field(default_factory=OverloadState)
-    law: LawState = msgspec.field(default_factory=LawState)
     limp_legs: LimpLegWatch = msgspec.field(default_factory=LimpLegWatch)
-    attitude: Attitude | None = None
-    attitude_ns: int = 0
-    attitude_seq: int = -1
-    trips: TripsState = msgspec.field(default_factory=TripsState)
-    request: OperatorRequest = OperatorRequest()
-    unattended: UnattendedState = msgspec.field(default_factory=UnattendedState)
-    trust: HarnessTrust = msgspec.field(default_factory=HarnessTrust)
+    support: Support = Support.NONE
+    """Modules that stiffen for a limp one."""
     phases: PhasesState = msgspec.field(default_factory=PhasesState)
-    rival: RivalWatch = msgspec.field(default_factory=RivalWatch)
+    trust: HarnessTrust = msgspec.field(default_factory=HarnessTrust)
     heat: HeatWatchState = msgspec.field(default_factory=HeatWatchState)
     supply: SupplyState = msgspec.field(default_factory=SupplyState)
-    guard: GuardState | None = None
-    """None without a controller of somebody's own."""
-    refused: int = 0
-    """Implausible measurements so far."""
+    law: LawState = msgspec.field(default_factory=LawState)
+    guard: GuardState = msgspec.field(default_factory=GuardState)
+    """Changes only if a controller of your own runs."""
+    unattended: Unattended = msgspec.field(default_factory=Unattended)
+    trips: TripsState = msgspec.field(default_factory=TripsState)
+
+
+class Inputs(NamedTuple):
+    """Measurements and requests that one tick uses."""
+
+    now_ns: int
+    dt: float
+    """Time since the last tick, s."""
+    states: list[JointState]
+    """Newest of each module, of any age."""
+    fresh: list[bool]
+    """True if a module's state has come within `planner.state_stale_ms`."""
+    q: Array
+    """(12,), rad"""
+    v: Array
+    """(12,), rad/s"""
+    tau: Array
+    """(12,), N m"""
+    wrench: Wrench | None
+    """Newest of the harness; None if it is invalid or too old."""
+    up: Vector3 | None
+    """Unit vector against gravity, torso axes; None if it is invalid or too old."""
+    request: OperatorRequest
 
 
 class _Ages(NamedTuple):
@@ -107,7 +124,14 @@ class _Ages(NamedTuple):
 
 
 class Planner:
-    """Whole-body law behind its engagement rule."""
+    """Whole-body law behind its engagement rule.
+
+    Attributes:
+        session: drawn at random at each start; sent in every command.
+        state: all that changes from tick to tick. A snapshot is a copy of it
+            (`shared.state.copied`), and another planner that gets the copy continues bit for bit.
+            A controller of your own keeps its state itself.
+    """
 
     def __init__(
         self, config: RobotConfig, session: int, controller: Controller | None = None
@@ -116,10 +140,11 @@ class Planner:
 
         Args:
             config: the robot.
-            session: drawn at random at each start; sent in every command.
-            controller: in the place of the shipped law; its own state is in no snapshot.
+            session: drawn at random.
+            controller: in the place of the shipped law.
         """
         self.session = session
+        self.state = PlannerState()
         if controller is not None:  # an integral of the law would wind up against it
             law = msgspec.structs.replace(config.law, push_integral_max=0.0)
             config = msgspec.structs.replace(config, law=law)
@@ -131,7 +156,6 @@ class Planner:
         self._overload = Overload(config.harness)
         self._trips = PlannerTrips(config)
         self._soles = Soles(config)
-        self._unattended = Unattended()
         self._heat = HeatWatch(config.heat)
         self._supply = SupplyWatch(config.supply)
         service = config.joint_service
@@ -143,56 +167,42 @@ class Planner:
             attitude=round(config.imu.stale_ms * NS_PER_MS),
             command=round(service.max_command_age_ms * NS_PER_MS),
         )
-        self._state = PlannerState(
-            overload=self._overload.state,
-            trips=self._trips.state,
-            unattended=self._unattended.state,
-            phases=self._phases.state,
-            heat=self._heat.state,
-            supply=self._supply.state,
-            guard=None if self._guard is None else self._guard.state,
-        )
-        self._q: Array = np.zeros(N_JOINTS)
-        self._v: Array = np.zeros(N_JOINTS)
-        self._tau: Array = np.zeros(N_JOINTS)
-        self._new = 0  # bit i: module i has a state that no tick has used
-        self._support = Support.NONE
         self._output: LawOutput | None = None
 
     @property
     def compares_arrivals(self) -> bool:
         """True if the next states' arrivals count (`services.planner.state_phases`)."""
-        return self._phases.compares
+        return self._phases.compares(self.state.phases)
 
     def receive_state(self, module: int, state: JointState, now_ns: int) -> None:
         """Store a module's newest state, if it is plausible."""
+        s = self.state
         if not self._plausible.is_state(module, state):
+            s.refused += 1
             return
-        self._state.states[module] = state
-        self._state.arrived_ns[module] = now_ns
-        self._new |= 1 << module
-        self._q[2 * module : 2 * module + 2] = state.q
-        self._v[2 * module : 2 * module + 2] = state.v
-        self._tau[2 * module : 2 * module + 2] = state.tau
+        s.states[module], s.arrived_ns[module] = state, now_ns
+        s.new |= 1 << module
 
     def receive_wrench(self, wrench: Wrench, now_ns: int) -> None:
         """Store the harness's newest wrench, if it is plausible."""
+        s = self.state
         if not self._plausible.is_wrench(wrench):
+            s.refused += 1
             return
-        self._state.wrench_seq = wrench.seq
-        self._state.wrench, self._state.wrench_ns = wrench, now_ns
-        self._overload.receive(wrench, now_ns)
+        s.wrench, s.wrench_ns = wrench, now_ns
+        self._overload.receive(s.overload, wrench, now_ns)
 
     def receive_attitude(self, attitude: Attitude, now_ns: int) -> None:
         """Store the IMU's newest attitude, if it is plausible."""
+        s = self.state
         if not self._plausible.is_attitude(attitude):
+            s.refused += 1
             return
-        self._state.attitude_seq = attitude.seq
-        self._state.attitude, self._state.attitude_ns = attitude, now_ns
+        s.attitude, s.attitude_ns = attitude, now_ns
 
     def receive_request(self, request: OperatorRequest) -> None:
         """Store the operator's current request (`services.planner.intents`)."""
-        self._state.request = request
+        self.state.request = request
 
     def is_due(self, now_ns: int) -> bool:
         """Return True if a tick is due: as soon as all six modules have a new state.
@@ -201,8 +211,8 @@ class Planner:
         gains. On its own timer the planner would let states age for up to a period. Waiting for
         them, it ticks at their rate, and it waits only briefly for late ones.
         """
-        since_s = (now_ns - self._state.last_ns) / NS_PER_S
-        if self._new == _ALL_NEW:
+        since_s = (now_ns - self.state.last_ns) / NS_PER_S
+        if self.state.new == _ALL_NEW:
             return since_s >= EARLY_FRACTION * self._period_s
         return since_s >= LATE_FRACTION * self._period_s
 
@@ -215,147 +225,174 @@ class Planner:
         Args:
             now_ns: the planner's monotonic clock.
         """
-        last_ns = self._state.last_ns
-        dt = min((now_ns - last_ns) / NS_PER_S, TICK_GAP_MAX_S)
-        if not last_ns:
-            dt = self._period_s
-        self._state.last_ns = now_ns
-        self._new = 0
-        states = [state for state in self._state.states if state is not None]
-        if len(states) < N_MODULES:
+        s, last_ns = self.state, self.state.last_ns
+        inputs = self._inputs(now_ns)
+        s.last_ns, s.new = now_ns, 0
+        if inputs is None:
             return []
-        fresh = [now_ns - arrived <= self._ages.state for arrived in self._state.arrived_ns]
-        self._watch_rival([states[i] for i in range(N_MODULES) if fresh[i]])
-        engagement = self._state.engagement
-        engagement.advance(
+        self._decide(inputs, last_ns)
+        load = s.law.load
+        tare = Tare.DONE if s.wrench is None else s.wrench.tare
+        trusted = s.trust.advance(load, tare, inputs.dt, leads=not s.engagement.hold)
+        if s.trust.doubted:
+            inputs = inputs._replace(wrench=None)
+        self._output = output = self._run_law(inputs, trusted * inputs.request.assist_n)
+        s.source = output.local.source
+        self._watch(inputs, output)
+        s.seq += 1
+        if not s.rival.yields:
+            return self._commands(inputs, output)
+        return self._announcement(inputs, output)
+
+    def _inputs(self, now_ns: int) -> Inputs | None:
+        """Return what a tick now uses; None until every module has sent a state."""
+        s, ages = self.state, self._ages
+        states = [state for state in s.states if state is not None]
+        if len(states) < N_MODULES:
+            return None
+        dt = min((now_ns - s.last_ns) / NS_PER_S, TICK_GAP_MAX_S) if s.last_ns else self._period_s
+        wrench, attitude = s.wrench, s.attitude
+        if wrench is not None and not (wrench.valid and now_ns - s.wrench_ns <= ages.wrench):
+            wrench = None
+        up = None
+        if attitude is not None and attitude.valid and now_ns - s.attitude_ns <= ages.attitude:
+            up = attitude.up
+        return Inputs(
             now_ns,
-            fresh,
+            dt,
+            states,
+            fresh=[now_ns - arrived <= ages.state for arrived in s.arrived_ns],
+            q=np.array([state.q for state in states]).ravel(),
+            v=np.array([state.v for state in states]).ravel(),
+            tau=np.array([state.tau for state in states]).ravel(),
+            wrench=wrench,
+            up=up,
+            request=s.request,
+        )
+
+    def _decide(self, inputs: Inputs, last_ns: int) -> None:
+        """Decide who leads, which modules stiffen, and when each sends its states."""
+        s, states = self.state, inputs.states
+        recent = [state for state, fresh in zip(states, inputs.fresh, strict=True) if fresh]
+        if s.rival.advance(self.session, recent, self._ages.command):
+            self.session += 1  # modules have retired this one
+        s.engagement.advance(
+            inputs.now_ns,
+            inputs.fresh,
             [state.ready and state.session == self.session for state in states],
             [state.mode for state in states],
             self._inhibit(),
         )
-        self._support = self._state.limp_legs.advance(now_ns, states)
-        self._phases.advance(states, self._state.arrived_ns, last_ns)
-        request = self._state.request
-        tare = Tare.DONE if self._state.wrench is None else self._state.wrench.tare
-        trusted = self._state.trust.advance(
-            self._law.load.state, tare, dt, leads=not engagement.hold
+        s.support = s.limp_legs.advance(inputs.now_ns, states)
+        self._phases.advance(s.phases, states, s.arrived_ns, last_ns)
+
+    def _run_law(self, inputs: Inputs, assist_requested: float) -> LawOutput:
+        """Return the output of the law, or of a controller of your own in its place."""
+        s, dt = self.state, inputs.dt
+        heat = self._heat.advance(s.heat, inputs.now_ns, inputs.states, assist_requested, dt)
+        self._supply.advance(s.supply, inputs.states, dt)
+        output = self._law.tick(
+            s.law,
+            LawInputs(
+                inputs.q,
+                inputs.v,
+                dt,
+                assist=heat.assist,
+                shift=inputs.request.shift,
+                toward=self._toward(heat.toward),
+                released=s.unattended.released,
+                pitch_drive=s.unattended.pitch.drive,
+                # until all engage, the law restarts from the measured pose: there is no step
+                align=s.engagement.hold,
+                wrench=inputs.wrench,
+                up_torso=inputs.up,
+            ),
         )
-        heat = self._heat.advance(now_ns, states, trusted * request.assist_n, dt)
-        self._supply.advance(states, dt)
-        # until all engage, the law restarts from the measured pose each tick: there is no
-        # step
-        self._output = self._law.tick(
-            self._q,
-            self._v,
-            heat.assist,
-            dt,
-            shift_requested=request.shift,
-            toward=self._toward(heat.toward),
-            released=self._state.unattended.released,
-            pitch_drive=self._state.unattended.pitch.drive,
-            align=engagement.hold,
-            wrench=self._usable_wrench(now_ns),
-            up_torso=self._usable_up(now_ns),
+        if self._guard is None:
+            return output
+        seen = Observation(
+            time_s=0.0,
+            dt=dt,
+            q=inputs.q,
+            v=inputs.v,
+            tau=inputs.tau,
+            p=output.p,
+            pdot=output.pdot,
+            J=self._law.measured.J.copy(),
+            T=self._law.reference.T.copy(),
+            wrench=inputs.wrench,
+            request=inputs.request,
+            law=output,
         )
-        if self._guard is not None:
-            self._output = self._controlled(self._guard, self._output, now_ns, dt)
-        self._state.source = self._output.local.source
-        loads = self._law.measured.leg_loads(self._tau)
-        lifted, leads = self._lifted(now_ns), not engagement.hold
-        self._heat.state.lifted = lifted
-        all_carry = all(state.mode in _CARRIES for state in states)
-        is_fresh = engagement.mode is not _WAITING
-        known = is_fresh and all_carry and not any(map(math.isnan, loads))
-        if known:
-            self._law.weigh(self._tau, self._v, self._usable_wrench(now_ns), dt, led=leads)
+        return self._guard.act(s.guard, seen, leads=not s.engagement.hold)
+
+    def _watch(self, inputs: Inputs, output: LawOutput) -> None:
+        """Estimate the load, and check the trips at the measured pose."""
+        s, wrench, leads = self.state, inputs.wrench, not self.state.engagement.hold
+        lifted = None
+        if wrench is not None:
+            lifted = force_up(wrench.force, float(output.p[3]), float(output.p[4]))
+        s.heat.lifted = lifted
+        loads = self._law.measured.leg_loads(inputs.tau)
+        all_carry = all(state.mode in _CARRIES for state in inputs.states)
+        is_fresh = s.engagement.mode is not _WAITING
+        if is_fresh and all_carry and not any(map(math.isnan, loads)):
+            self._law.weigh(s.law.load, inputs.tau, inputs.v, wrench, inputs.dt, led=leads)
         else:
-            self._law.load.pause()
+            s.law.load.rates = None
+        hand = math.nan, math.nan
+        if wrench is not None and lifted is not None and not self._sits:
+            hand = lifted + output.assist, wrench.moment[1]
+        pose, rates = output.p.tolist(), output.pdot.tolist()
+        drift = s.unattended.advance(
+            inputs.now_ns, (pose[2], pose[4]), (rates[2], rates[4]), hand, leads=leads
+        )
         soles = self._soles.loads(loads)
-        edge = self._soles.edge(self._tau, soles)
-        rate = self._law.harness_rate(self._v)
-        drift = self._drift(now_ns, lifted, leads=leads)
-        moves = self._heat.moves
         values = values_of(
-            self._output, self._q, soles, edge, lifted, rate, drift, leads=leads, moves=moves
+            output,
+            inputs.q,
+            soles,
+            self._soles.edge(inputs.tau, soles),
+            lifted,
+            self._law.harness_rate(inputs.v),
+            drift,
+            leads=leads,
+            moves=s.heat.moves,
         )
-        self._trips.advance(now_ns, values, leads=leads)
-        self._state.seq += 1
-        if self._state.rival.yields:
-            return self._announcement(now_ns, states, self._output)
-        return self._commands(now_ns, states, self._output)
+        self._trips.advance(s.trips, inputs.now_ns, values, leads=leads)
 
-    def snapshot(self) -> PlannerState:
-        """Return a copy of the state between two ticks; `restore` continues from it."""
-        refused = self._plausible.refused
-        return copied(
-            msgspec.structs.replace(self._state, law=self._law.snapshot(), refused=refused)
-        )
-
-    def restore(self, snapshot: PlannerState) -> None:
-        """Continue from a copy of a state, bit for bit."""
-        self._state = own = copied(snapshot)
-        for module, (state, arrived_ns) in enumerate(zip(own.states, own.arrived_ns, strict=True)):
-            if state is not None:
-                self.receive_state(module, state, arrived_ns)
-        self._plausible.refused = own.refused
-        self._law.restore(own.law)
-        self._overload.state = own.overload
-        self._trips.restore(own.trips)
-        self._unattended.state, self._phases.state = own.unattended, own.phases
-        self._heat.state = own.heat
-        self._supply.state = own.supply
-        if self._guard is not None:
-            if own.guard is not None:
-                self._guard.state = own.guard
-            own.guard = self._guard.state
-
-    def _watch_rival(self, states: Sequence[JointState]) -> None:
-        """Find out if another planner leads, and if modules have retired this one's session."""
-        if self._state.rival.advance(self.session, states, self._ages.command):
-            self.session += 1
-
-    def _announcement(
-        self, now_ns: int, states: Sequence[JointState], output: LawOutput
-    ) -> list[JointCommand]:
+    def _announcement(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
         """Return now and then commands that answer no state: too old, whatever the network does."""
-        if not self._state.rival.announces(now_ns):
+        if not self.state.rival.announces(inputs.now_ns):
             return []
         earlier_ns = 2 * self._ages.command
         return [
             msgspec.structs.replace(command, hold=True, echo_t_ns=command.echo_t_ns - earlier_ns)
-            for command in self._commands(now_ns, states, output)
+            for command in self._commands(inputs, output)
         ]
 
     @property
     def yields(self) -> bool:
         """True while another planner leads, and this one waits."""
-        return self._state.rival.yields
+        return self.state.rival.yields
 
     @property
     def rival(self) -> str:
-        """What there is to say of another planner that leads; empty if there is none."""
-        return self._state.rival.describe()
+        """Description of the rival planner that leads, or an empty string."""
+        return self.state.rival.describe()
 
-    def _commands(
-        self, now_ns: int, states: Sequence[JointState], output: LawOutput
-    ) -> list[JointCommand]:
+    def _commands(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
         """Return the tick's six commands; each echoes the stamp of its module's state."""
-        local, hold, support = output.local, self._hold(), self._support
-        margins = local.margins
+        s, local, hold = self.state, output.local, self._hold()
         arrays = (
             output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
             local.D, local.D_B,
         )  # fmt: skip
         pairs = [list(zip(row[::2], row[1::2], strict=True)) for row in map(_listed, arrays)]
-        commands = []
-        for module, state, phase, *row in zip(
-            MODULES, states, self._state.phases.phases, *pairs, strict=True
-        ):
-            q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d = row
-            command = JointCommand(
-                t_ns=now_ns,
-                seq=self._state.seq,
+        return [
+            JointCommand(
+                t_ns=inputs.now_ns,
+                seq=s.seq,
                 session=self.session,
                 echo_t_ns=state.t_ns,
                 hold=hold,
@@ -366,52 +403,15 @@ class Planner:
                 tau_coupled=tau_coupled,
                 k_p=k_p,
                 k_d=k_d,
-                margin=margins.service,
-                margin_onboard=margins.onboard,
-                stiffen=support.includes(module),
+                margin=local.margins.service,
+                margin_onboard=local.margins.onboard,
+                stiffen=s.support.includes(module),
                 state_phase=phase,
             )
-            commands.append(command)
-        return commands
-
-    def _controlled(
-        self, guard: ControllerGuard, law: LawOutput, now_ns: int, dt: float
-    ) -> LawOutput:
-        """Return the output of somebody's own controller in the place of the law's."""
-        seen = Observation(
-            time_s=0.0,
-            dt=dt,
-            q=self._q.copy(),
-            v=self._v.copy(),
-            tau=self._tau.copy(),
-            p=law.p,
-            pdot=law.pdot,
-            J=self._law.measured.J.copy(),
-            T=self._law.reference.T.copy(),
-            wrench=self._usable_wrench(now_ns),
-            request=self._state.request,
-            law=law,
-        )
-        return guard.act(seen, leads=not self._state.engagement.hold)
-
-    def _usable_wrench(self, now_ns: int) -> Wrench | None:
-        """Return the newest wrench, or None if it is invalid, too old or not believed."""
-        s = self._state
-        wrench = s.wrench
-        if wrench is None or not wrench.valid or s.trust.doubted:
-            return None
-        return wrench if now_ns - s.wrench_ns <= self._ages.wrench else None
-
-    def _drift(self, now_ns: int, lifted: float | None, *, leads: bool) -> float:
-        """Return how far the robot has drifted since a hand was last felt, m."""
-        wrench, output = self._usable_wrench(now_ns), self._output
-        hand = math.nan, math.nan
-        p = pdot = [0.0] * 6
-        if output is not None:
-            p, pdot = output.p.tolist(), output.pdot.tolist()
-            if wrench is not None and lifted is not None and not self._sits:
-                hand = lifted + output.assist, wrench.moment[1]
-        return self._unattended.advance(now_ns, (p[2], p[4]), (pdot[2], pdot[4]), hand, leads=leads)
+            for module, state, phase, q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d in zip(
+                MODULES, inputs.states, s.phases.phases, *pairs, strict=True
+            )
+        ]
 
     def _toward(self, heat: Toward) -> Toward:
         """Return where the robot goes by itself; what is too warm goes first."""
@@ -420,35 +420,22 @@ class Planner:
     @property
     def _sits(self) -> bool:
         """True while the robot is to go down by itself."""
-        return self._state.request.sit or self._supply.state.sits
-
-    def _lifted(self, now_ns: int) -> float | None:
-        """Return the person's upward force on the robot, N, world; None if it is not known now."""
-        wrench, output = self._usable_wrench(now_ns), self._output
-        if wrench is None or output is None:
-            return None
-        return force_up(wrench.force, float(output.p[3]), float(output.p[4]))
-
-    def _usable_up(self, now_ns: int) -> Vector3 | None:
-        """Return the unit vector up, torso axes, or None if the newest is invalid or too old."""
-        attitude = self._state.attitude
-        if attitude is None or not attitude.valid:
-            return None
-        return attitude.up if now_ns - self._state.attitude_ns <= self._ages.attitude else None
+        return self.state.request.sit or self.state.supply.sits
 
     def _inhibit(self) -> PlannerMode | None:
         """Return why the planner may not engage, from the last tick's results; None if it may."""
-        if self._state.rival.yields:
+        s = self.state
+        if s.rival.yields:
             return PlannerMode.YIELDING
-        if self._overload.state.hold:
+        if s.overload.hold:
             return PlannerMode.OVERLOADED
-        if self._law.stance.refused:
+        if s.law.stance.refusal:
             return PlannerMode.MISPLACED
-        if self._law.load.refused:
+        if s.law.load.blocks:
             return PlannerMode.MISLOADED
-        if self._state.source is _UNCERTIFIED:
+        if s.source is _UNCERTIFIED:
             return PlannerMode.UNCERTIFIED
-        if self._trips.state.tripped:
+        if s.trips.tripped:
             return PlannerMode.TRIPPED
         return None
 
@@ -457,25 +444,26 @@ class Planner:
 
         It uses this tick's results: without a certificate no gains go to modules in TRACK.
         """
-        return self._state.engagement.hold or self._inhibit() is not None
+        return self.state.engagement.hold or self._inhibit() is not None
 
     def _why(self) -> str:
         """Return what the person must know: of the supply, of heat, and why it does not lead."""
+        s = self.state
         refusal = (
-            self._state.rival.describe()
-            or self._law.stance.refusal()
-            or self._law.load.refusal()
-            or self._trips.state.why
-            or self._heat.describe()
-            or self._unattended.describe()
-            or (self._guard.state.why if self._guard is not None else "")
+            s.rival.describe()
+            or s.law.stance.refusal
+            or self._law.load.refusal(s.law.load)
+            or s.trips.why
+            or self._heat.describe(s.heat)
+            or s.unattended.describe()
+            or s.guard.why
         )
-        parts = self._supply.describe(), self._state.trust.describe(), refusal
+        parts = self._supply.describe(s.supply), s.trust.describe(), refusal
         return "; ".join(filter(None, parts))
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
         """Return the inputs and decisions of the last tick."""
-        s, output, load = self._state, self._output, self._law.load.state
+        s, output, load = self.state, self._output, self.state.law.load
         seqs = [state.seq if state is not None else -1 for state in s.states]
         ages = [
             now_ns - arrived if state is not None else -1
@@ -484,8 +472,9 @@ class Planner:
         leads = not s.engagement.hold
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
-            vectors = output.p, output.pdot, output.p_ref, output.closure, output.stance
-            p, pdot, p_ref, closure, stance = map(_vector6, vectors)
+            vectors = output.p, output.pdot, output.p_ref, output.closure
+            p, pdot, p_ref, closure = map(vector6, vectors)
+            stance = output.stance
         return PlannerStatus(
             t_ns=now_ns,
             seq=s.seq,
@@ -504,22 +493,22 @@ class Planner:
             ik_residual=output.ik_residual if output is not None else 0.0,
             tick_us=tick_us,
             state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
-            wrench_seq=s.wrench_seq,
+            wrench_seq=-1 if s.wrench is None else s.wrench.seq,
             assist_requested_n=s.request.assist_n,
             state_age_ns=(ages[0], ages[1], ages[2], ages[3], ages[4], ages[5]),
             wait_s=0.0 if leads else s.engagement.wait_ns(now_ns) / NS_PER_S,
-            attitude_seq=s.attitude_seq,
+            attitude_seq=-1 if s.attitude is None else s.attitude.seq,
             slope=output.slope if output is not None else (0.0, 0.0),
             shift_requested=s.request.shift,
             load=(load.kg, load.a, load.b),
             requested_by=s.request.source,
             stance=stance,
             why=self._why(),
-            trip=int(self._trips.state.tripped),
-            refused=self._plausible.refused,
+            trip=int(s.trips.tripped),
+            refused=s.refused,
             sit=s.request.sit,
-            heat=int(self._heat.state.action),
-            heat_left_s=self._heat.state.left_s,
+            heat=int(s.heat.action),
+            heat_left_s=s.heat.left_s,
             supply_v=s.supply.volts,
         )
 
@@ -527,8 +516,3 @@ class Planner:
 def _listed(values: Array) -> list[float]:
     numbers: list[float] = values.tolist()
     return numbers
-
-
-def _vector6(values: Array) -> Vector6:
-    a, b, c, d, e, f = values.tolist()
-    return a, b, c, d, e, f

@@ -57,28 +57,30 @@ class StatePhases:
     def __init__(self, rate_hz: float, state_rate_hz: float) -> None:
         self._n = round(rate_hz / state_rate_hz)
         self._radians_per_ns = 2.0 * math.pi * state_rate_hz / NS_PER_S
-        self.state = PhasesState()
 
-    @property
-    def compares(self) -> bool:
-        """True if the next tick's arrivals are compared: they must not be rounded up by a rest."""
-        state = self.state
+    def compares(self, state: PhasesState) -> bool:
+        """Return True if the next tick's arrivals are compared: no rest may round them up."""
         return self._n > 1 and bool(state.phases) and state.tick < COMPARED_TICKS
 
     def advance(
-        self, states: Sequence[JointState], arrived_ns: Sequence[int], last_tick_ns: int
+        self,
+        state: PhasesState,
+        states: Sequence[JointState],
+        arrived_ns: Sequence[int],
+        last_tick_ns: int,
     ) -> None:
         """Compare the states of a tick, if all six are new.
 
         Args:
+            state: of the phases, which changes.
             states: of the six modules.
             arrived_ns: their arrivals, by the planner's clock.
             last_tick_ns: time of the tick before.
         """
-        state, n, first_ns = self.state, self._n, arrived_ns[0]
+        n, first_ns = self._n, arrived_ns[0]
         if not state.phases:  # as the last planner left them
             state.phases = [one.state_phase % n for one in states]
-        compares = self.compares and state.tick > 0  # before the first there was a rest
+        compares = self.compares(state) and state.tick > 0  # before the first there was a rest
         state.tick = (state.tick + 1) % state.every
         if not compares:
             return
@@ -86,12 +88,12 @@ class StatePhases:
             for module, (x, y) in enumerate(state.sums):
                 angle = self._radians_per_ns * (arrived_ns[module] - first_ns)
                 state.sums[module] = (x + math.cos(angle), y + math.sin(angle))
-        if not self.compares:
-            self._decide(states)
+        if not self.compares(state):
+            self._decide(state, states)
 
-    def _decide(self, states: Sequence[JointState]) -> None:
+    def _decide(self, own: PhasesState, states: Sequence[JointState]) -> None:
         """Choose the phases and when to compare next: soon if a module moved or was silent."""
-        own, n, count = self.state, self._n, COMPARED_TICKS - 1
+        n, count = self._n, COMPARED_TICKS - 1
         settled = True
         for module, (state, (x, y)) in enumerate(zip(states, own.sums, strict=True)):
             behind = n / (2.0 * math.pi) * math.atan2(y, x)

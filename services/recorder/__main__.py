@@ -23,9 +23,8 @@ from types import FrameType
 from typing import Final
 
 from services.recorder.auto_recover import AutoRecovery
-from services.recorder.disk_guard import MIB
-from services.recorder.host_watch import HostWatch, Roster
-from services.recorder.loop import CAPACITY, Recorder, free_bytes_at, summary
+from services.recorder.host_watch import MIB, HostWatch, Roster, free_bytes_at
+from services.recorder.loop import CAPACITY, Recorder, summary
 from services.recorder.snapshot import SnapshotRing
 from shared import log, revision, scheduling
 from shared.bus import topics

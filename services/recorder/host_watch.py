@@ -1,27 +1,99 @@
-"""What the recorder says beside the record: who is linked, what goes wrong on its host.
+"""What goes wrong on the recorder's host: a full disk, floods of the bus's ports; who is linked.
 
-No other service has the time to look for floods of the bus's ports and for a disk that fills.
+No other service has the time to look for them. When the disk is too full to go on recording,
+nothing is ever deleted: below the least free space the file is finished while there is still room
+for its end, and recording waits. Once there is clearly more again it goes on with the run's next
+file. A run that is stopped here does not end the recorder.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from services.recorder.disk_guard import MIB, DiskChange, SpaceGuard
-from services.recorder.loop import Deadline, free_bytes_at
 from shared.bus import topics
 from shared.bus.messages import ToolRoster
 from shared.bus.session import Session
 from shared.bus.sockets import Arrivals
 from shared.clock import NS_PER_MS, NS_PER_S
 
+MIB: Final = 1 << 20
+
+WARN: Final = 2.0
+"""Multiple of the least free space below which it warns."""
+RESUME: Final = 1.5
+"""Multiple of the least free space above which recording resumes."""
+CALM: Final = 2.5
+"""Multiple of the least free space above which the next warning is new."""
 RUN_DIR_MIN_MIB: Final = 16
 """Free space below which the run directory is called full: its logs lose lines soon."""
 _EVERY_NS: Final = 2 * NS_PER_S
 _AGAIN_NS: Final = 10 * NS_PER_S
 """A flood that lasts is said so often."""
+
+
+class DiskChange(Enum):
+    """Change at the newest look at the disk."""
+
+    NONE = 0
+    LOW = 1
+    FULL = 2
+    BACK = 3
+
+
+class SpaceGuard:
+    """Feed it the free space once in a while; a least free space of 0 switches it off."""
+
+    def __init__(self, least_mib: float) -> None:
+        self.enough = True
+        """Recording may go on."""
+        self._least = least_mib * MIB
+        self._warned = False
+
+    def feed(self, free_bytes: int) -> DiskChange:
+        """Take the free space; return what changes by it."""
+        if not self._least:
+            return DiskChange.NONE
+        if self.enough and free_bytes < self._least:
+            self.enough, self._warned = False, True
+            return DiskChange.FULL
+        if not self.enough:
+            if free_bytes < RESUME * self._least:
+                return DiskChange.NONE
+            self.enough = True
+            return DiskChange.BACK
+        if free_bytes >= CALM * self._least:
+            self._warned = False
+        if not self._warned and free_bytes < WARN * self._least:
+            self._warned = True
+            return DiskChange.LOW
+        return DiskChange.NONE
+
+
+def free_bytes_at(directory: Path) -> int:
+    """Return the free space where a directory is or will be; OSError if it cannot be read."""
+    while not directory.exists() and directory != directory.parent:
+        directory = directory.parent
+    found = os.statvfs(directory)
+    return found.f_bavail * found.f_frsize
+
+
+class Deadline:
+    """True once per period."""
+
+    def __init__(self, period_ns: int, now: int) -> None:
+        self._period_ns = period_ns
+        self._due_ns = now + period_ns
+
+    def passed(self, now: int) -> bool:
+        """Return True, and begin the next period, if this one is over."""
+        if now < self._due_ns:
+            return False
+        self._due_ns = now + self._period_ns
+        return True
 
 
 class HostWatch:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Final
 
-from services.recorder.disk_guard import MIB, DiskChange, SpaceGuard
+from services.recorder.host_watch import MIB, Deadline, DiskChange, SpaceGuard
 from services.recorder.snapshot import SnapshotRing
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import RecorderConfig
@@ -24,21 +22,6 @@ SLICE: Final = 8_192
 REPORT_PERIOD_S: Final = 10.0
 
 FreeBytes = Callable[[], int]
-
-
-class Deadline:
-    """True once per period."""
-
-    def __init__(self, period_ns: int, now: int) -> None:
-        self._period_ns = period_ns
-        self._due_ns = now + period_ns
-
-    def passed(self, now: int) -> bool:
-        """Return True, and begin the next period, if this one is over."""
-        if now < self._due_ns:
-            return False
-        self._due_ns = now + self._period_ns
-        return True
 
 
 class Recorder:
@@ -208,14 +191,6 @@ class Recorder:
             while self._writer.recording and self._writer.take_from(self._snapshot, SLICE):
                 pass
         self._leave_if_gone()
-
-
-def free_bytes_at(directory: Path) -> int:
-    """Return the free space where a directory is or will be; OSError if it cannot be read."""
-    while not directory.exists() and directory != directory.parent:
-        directory = directory.parent
-    found = os.statvfs(directory)
-    return found.f_bavail * found.f_frsize
 
 
 def summary(writer: RunWriter, snapshot: SnapshotRing | None = None) -> str:

@@ -9,13 +9,12 @@ import os
 import time
 from typing import Final
 
-from services.ros2_gateway.conversions import TIME_LAST_NS, Conversions
+from services.ros2_gateway.conversions import TIME_LAST_NS, Conversions, RosTypes
 from services.ros2_gateway.gateway import INPUTS, Gateway
 from services.ros2_gateway.inbound import Inbound, acceptable, inbound_topics
 from services.ros2_gateway.loop import PERIOD_NS, GatewayLoop, Input
 from services.ros2_gateway.rmw import domain
 from services.ros2_gateway.ros_session import RosLink, RosSession
-from services.ros2_gateway.ros_types import RosTypes
 from shared import log, process
 from shared.bus import session as bus
 from shared.bus import topics

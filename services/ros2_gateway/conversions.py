@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from services.ros2_gateway.ros_types import RosTypes
 from shared.bus.messages import (
     LOST_DRIVE,
     Cause,
@@ -21,10 +20,48 @@ from shared.bus.messages import (
 )
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.extras import late
 from shared.joints import AXES, MODULES, SIDES
 from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, leg_modules, rotation_about, torso_pose
 from shared.robot.robot_urdf import cross_of
 from shared.robot.trip_table import reason_of, remedy_of
+
+if TYPE_CHECKING:
+    from rosbags import typesys
+else:
+    typesys = late("rosbags.typesys")
+
+
+class RosTypes:
+    """The types of one of `shared.config.checks.ROS2_DISTRIBUTIONS`."""
+
+    def __init__(self, distribution: str) -> None:
+        self._store = typesys.get_typestore(typesys.Stores[f"ROS2_{distribution.upper()}"])
+
+    def hash(self, type_name: str) -> str:
+        """Return the hash of a type's description, such as `RIHS01_a13e...`."""
+        return self._store.hash_rihs01(type_name)
+
+    def make(self, type_name: str, /, **fields: Any) -> Any:
+        """Return a message; `fields` are all of its fields."""
+        return self._store.types[type_name](**fields)
+
+    def encode(self, type_name: str, message: Any) -> bytes:
+        """Return a message in CDR, little endian, with its header of four bytes."""
+        return bytes(self._store.serialize_cdr(message, type_name))
+
+    def decode(self, type_name: str, payload: bytes) -> Any | None:
+        """Return the message of a payload from the network; None if it is not of this type."""
+        try:
+            return self._store.deserialize_cdr(payload, type_name)
+        except Exception:  # noqa: BLE001 - whatever a stranger's bytes bring about
+            return None
+
+    def definition(self, type_name: str) -> str:
+        """Return a type and those it is made of in ROS 2's message language."""
+        text, _ = self._store.generate_msgdef(type_name, ros_version=2)
+        return text
+
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"

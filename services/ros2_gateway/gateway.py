@@ -110,7 +110,7 @@ class Gateway:
         return found
 
     def _at(self, topic: Topic, module: str, now_ns: int) -> Any | None:
-        """Return a key's newest message; None if there is none, or it is history."""
+        """Return a key's newest message; None if it is missing or stale."""
         arrived_ns, message = self._newest.get((topic, module), (0, None))
         return message if now_ns - arrived_ns <= STALE_NS else None
 

@@ -20,7 +20,7 @@ ACCEPTABLE: Final = ("estop", "intent")
 STOPPED: Final = (Mode.DAMP, Mode.FAULT)
 REPEAT_NS: Final = 50 * NS_PER_MS
 GIVE_UP_NS: Final = 5 * NS_PER_S
-"""A stop is repeated until every module has stopped, and for so long at most."""
+"""Maximum time for which a stop is repeated while modules have not stopped, ns."""
 
 
 class InboundTopics(NamedTuple):

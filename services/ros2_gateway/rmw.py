@@ -65,7 +65,7 @@ class RosNode(NamedTuple):
 
 
 def domain(text: str) -> int:
-    """Return a domain from a command line; ArgumentTypeError if it is none: 0 to 232."""
+    """Return a domain from a command line; ArgumentTypeError outside of 0 to 232."""
     if not (text.strip().isdecimal() and int(text) <= DOMAIN_MAX):
         raise argparse.ArgumentTypeError(f"{text[:40]!r}: a domain is from 0 to {DOMAIN_MAX}")
     return int(text)
@@ -122,7 +122,7 @@ class SeenEndpoint(NamedTuple):
 
 
 def read_token(key: str) -> SeenEndpoint | None:
-    """Return what a token says; None if it is none."""
+    """Parse a liveliness token; return None if it is not one."""
     parts = key.split("/")
     if len(parts) not in (9, 13) or parts[0] != ADMIN_SPACE:
         return None

@@ -13,8 +13,8 @@ import zenoh
 import zenoh.ext
 
 from services.ros2_gateway import rmw
+from services.ros2_gateway.conversions import RosTypes
 from services.ros2_gateway.rmw import RosNode, RosTopic, SeenEndpoint
-from services.ros2_gateway.ros_types import RosTypes
 from shared.exceptions import BusError
 
 NODE: Final = "xrl"

@@ -1,4 +1,4 @@
-"""`python -m services.simulator`: the robot, where there is none."""
+"""`python -m services.simulator`: a simulated robot in place of a real one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from services.simulator.drives.axis_settings import preset
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
 from services.simulator.fronts.fibre_port import FibreHub, FibrePort
-from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from services.simulator.fronts.usb_standin import FOLDER
 from services.simulator.loop import SimulatorLoop, SimulatorPorts
-from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import plant_from
-from services.simulator.physics.world import World
+from services.simulator.robot import SimulatedRobot, axes_by_bus
 from shared import log, scheduling
 from shared.bus import topics
 from shared.bus.messages import HandLead, OperatorIntent, SimControl
@@ -88,46 +86,31 @@ def main() -> int:
             hand=session.latest(topics.OPERATOR_HAND, HandLead),
         )
         hubs = open_hubs(robot, arguments.run_dir, stack)
-        bank = AxisBank(
-            robot.drive,
-            encoder_counts_per_turn=robot.joint.encoder_counts_per_turn,
-            motor_signs=robot.motor_signs(),
-            heat=true_plant.heat,
-        )
+        made = SimulatedRobot(
+            robot, true_plant, scenario, cells=hubs[robot.harness.bus],
+            imu=hubs[robot.imu.bus] if robot.imu.fitted else None, seed=arguments.seed,
+            lifted=arguments.lifted,
+        )  # fmt: skip
+        buses = axes_by_bus(robot)
         front = CanSimpleFront(
-            bank,
-            [hubs[name] for name in drive_buses(robot)],
-            list(drive_buses(robot).values()),
+            made.bank,
+            [hubs[name] for name in buses],
+            list(buses.values()),
             heartbeat_period_ms=robot.drive.heartbeat_period_ms,
             dialect=robot.simulation.can_dialect,
         )
         for words in arguments.drive_setting:
-            preset(bank.settings, words)
+            preset(made.bank.settings, words)
         for axis in range(N_JOINTS if arguments.drive_setting else 0):
-            bank.calibration.restart(axis)
-        usb = open_usb(robot, bank, arguments.run_dir, stack)
-        harness = HarnessFront(robot, hubs[robot.harness.bus], arguments.seed)
-        imu = None
-        if robot.imu.fitted:
-            imu = ImuFront(robot.imu, true_plant.imu, hubs[robot.imu.bus], arguments.seed)
-        world = World(body_of(robot, true_plant), scenario, arguments.lifted)
+            made.bank.calibration.restart(axis)
+        usb = open_usb(robot, made.bank, arguments.run_dir, stack)
         logger.info("up, %s, scenario %s", granted, scenario.name)
         freeze_garbage()
-        loop = SimulatorLoop(robot, world, bank, front, usb, (harness, imu), ports)
+        loop = SimulatorLoop(robot, made, front, usb, ports)
         loop.autostart_s = arguments.autostart
         loop.run(stop)
     logger.info("stopped")
     return 0
-
-
-def drive_buses(robot: RobotConfig) -> dict[str, dict[int, int]]:
-    """Return, for each bus with drives, the axis (0..11) of each CAN node on it."""
-    buses: dict[str, dict[int, int]] = {}
-    for module in robot.module:
-        nodes = buses.setdefault(module.bus, {})
-        for side, node in enumerate(module.node_ids):
-            nodes[node] = 2 * MODULE_INDEX[module.name] + side
-    return buses
 
 
 def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
@@ -136,7 +119,7 @@ def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, 
     sensors = [robot.harness.bus, *([robot.imu.bus] if robot.imu.fitted else [])]
     hubs = {
         name: stack.enter_context(UnixCanHub(Path(expand(robot.can[name].channel, run_dir))))
-        for name in dict.fromkeys([*drive_buses(robot), *sensors])
+        for name in dict.fromkeys([*axes_by_bus(robot), *sensors])
     }
     for name in sensors:
         hubs[name].shared = True

@@ -1,22 +1,17 @@
-"""The simulator's loop: drives, world and sensors in real time; it waits for nobody."""
+"""The simulator's loop: drives, world and sensors in real time; it waits for no service."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 
-from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fault_injector import FaultInjector
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.fibre_port import FibreHub
-from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
-from services.simulator.physics.world import World
-from services.simulator.state import read_state
+from services.simulator.robot import SimulatedRobot
 from shared.bus.messages import HandLead, OperatorIntent, SimControl, Vector4
 from shared.bus.session import Latest, Publisher
-from shared.bus.topics import SIM_STATE
 from shared.bus.traces import SimState, SimTruth
 from shared.can.cansimple import AxisState
 from shared.clamp import clamp
@@ -25,7 +20,6 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.process import StopFlag
 
-INTENT_RATE_HZ: Final = 50.0
 SILENT_INTENTS: Final = 250
 """Intents of the scenario left out after somebody else's last: until that has faded out."""
 
@@ -41,34 +35,6 @@ class SimulatorPorts(msgspec.Struct, frozen=True):
     hand: Latest[HandLead]
 
 
-class Periods(NamedTuple):
-    """Steps of the world from one of each to the next."""
-
-    encoders: int
-    harness: int
-    imu: int
-    truth: int
-    intent: int
-    state: int
-
-
-def periods_of(config: RobotConfig) -> Periods:
-    """Return how often each is due."""
-    simulation = config.simulation
-
-    def steps(rate_hz: float) -> int:
-        return max(1, round(1.0 / simulation.timestep / rate_hz))
-
-    return Periods(
-        encoders=steps(simulation.encoder_rate_hz),
-        harness=steps(config.harness.rate_hz),
-        imu=steps(config.imu.rate_hz),
-        truth=steps(simulation.truth_rate_hz),
-        intent=steps(INTENT_RATE_HZ),
-        state=steps(SIM_STATE.rate_hz),
-    )
-
-
 class Pace(msgspec.Struct):
     """What was skipped of the clock, and where all stood when the scenario started."""
 
@@ -80,7 +46,7 @@ class Pace(msgspec.Struct):
 
 
 def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tuple[float, Vector4]:
-    """Return the assist, N, and the shift that the planner would grant: the person rests no more.
+    """Return the assist, N, and the shift, clamped to what the planner would grant.
 
     Asked for 1e9 N, the simulated person rested 1e9 N on the robot.
     """
@@ -97,29 +63,23 @@ class SimulatorLoop:
     torque between frames; with a loop of their own they step with the world.
 
     Attributes:
-        autostart_s: start the scenario by itself, so long after the hoist is down; None: do not.
+        autostart_s: delay from hoist down to the start of the scenario, s; None: a message
+            starts it.
     """
 
     def __init__(
         self,
         config: RobotConfig,
-        world: World,
-        bank: AxisBank,
+        robot: SimulatedRobot,
         front: CanSimpleFront,
         usb: Sequence[FibreHub],
-        sensors: tuple[HarnessFront, ImuFront | None],
         ports: SimulatorPorts,
     ) -> None:
-        self._config = config
-        self._world, self._bank, self._front = world, bank, front
-        (self._harness, self._imu), self._ports = sensors, ports
-        self._usb = usb
-        self._faults = FaultInjector(world.scenario.fault, bank)
-        self._every = periods_of(config)
-        self._step_ns = round(config.simulation.timestep * NS_PER_S)
+        self._config, self._robot = config, robot
+        self._world, self._bank, self._every = robot.world, robot.bank, robot.every
+        self._front, self._usb, self._ports = front, usb, ports
         self._slip_ns = round(config.simulation.late_slip_ms * NS_PER_MS)
         self.autostart_s: float | None = None
-        self._torque = bank.torque
         self._steps = 0
         self._hoisted_step = 0
         self._intents = 0
@@ -135,7 +95,7 @@ class SimulatorLoop:
         due = now_ns()
         while not stop:
             self.step()
-            due += self._step_ns
+            due += self._every.step
             behind = now_ns() - due
             if behind > self._slip_ns:
                 self._pace.lost_ns += behind
@@ -144,30 +104,29 @@ class SimulatorLoop:
 
     def step(self) -> None:
         """Apply the drives' frames, advance the world by one step, send what is due."""
-        world, front, every = self._world, self._front, self._every
-        if self._steps % every.encoders == 0:
-            self._faults.advance(world.scenario_s)
+        robot, front, every = self._robot, self._front, self._every
+        if self._steps * every.step % every.encoders == 0:
+            robot.begin_faults()
             front.receive()
-            self._torque = self._bank.step(world.time, *world.motor_turns())
+            robot.step_drives()
             front.send_encoders()
-            front.send_heartbeats(world.time)
+            front.send_heartbeats(self._world.time)
         elif self._bank.regulates:
-            self._torque = self._bank.step(world.time, *world.motor_turns())
+            robot.step_drives()
         for hub in self._usb:
             hub.poll()
-        world.step(self._torque)
+        robot.step_world()
         self._steps += 1
-        steps = self._steps
-        if steps % every.harness == 0:
-            self._harness.send(world.outside.harness_force, world.outside.harness_moment)
-        if self._imu is not None and steps % every.imu == 0:
-            self._imu.send(world)
-        if steps % every.truth == 0:
+        at_ns = self._steps * every.step
+        if at_ns % every.harness == 0:
+            robot.feel()
+        if robot.imu is not None and at_ns % every.imu == 0:
+            robot.imu.send(self._world)
+        if at_ns % every.truth == 0:
             self._publish_truth()
-        if steps % every.state == 0:
-            state = read_state(world, self._bank, now_ns(), steps // every.state)
-            self._ports.state.put(state)
-        if steps % every.intent == 0:
+        if at_ns % every.state == 0:
+            self._ports.state.put(robot.read_state(now_ns(), at_ns // every.state))
+        if at_ns % every.intent == 0:
             self._ask()
 
     def _ask(self) -> None:
@@ -213,7 +172,7 @@ class SimulatorLoop:
         if all(state == AxisState.CLOSED_LOOP_CONTROL for state in self._bank.state):
             world.release_hoist()
         wall_ns = now - pace.start_ns
-        simulated_ns = (self._steps - pace.start_step) * self._step_ns
+        simulated_ns = (self._steps - pace.start_step) * self._every.step
         factor = simulated_ns / wall_ns if pace.start_ns and wall_ns > 0 else 1.0
         late_s = (pace.lost_ns - pace.lost_at_start_ns) / NS_PER_S
         self._ports.truth.put(world.truth(now, factor, late_s))

@@ -19,8 +19,8 @@ from shared.bus.topics import OPERATOR, PRINCIPALS, VIEWER
 from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError, ConfigError, FleetError
+from shared.places import in_home
 from shared.toml_file import Section, read_toml
-from shared.user import in_home
 
 AUTHORITY: Final = "authority.pem"
 NAMES: Final = "names.toml"

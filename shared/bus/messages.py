@@ -170,7 +170,7 @@ class DriveStatus(IntEnum):
     HOLDING = 5
     """Both axes are in closed loop by an earlier service and wait for the take-over."""
     UNACKNOWLEDGED = 6
-    """Lost, and the CAN bus carries no frame: nobody is there to acknowledge one."""
+    """Lost, and the CAN bus carries no frame: no node acknowledges its frames."""
 
 
 LOST_DRIVE: Final = (DriveStatus.LOST, DriveStatus.UNACKNOWLEDGED)
@@ -207,7 +207,7 @@ class HeatAction(IntEnum):
 
     NONE = 0
     EASES = 1
-    """The assist goes, as far as nobody rests on it, and the person is told."""
+    """Assist ramps down to the weight that the wearer rests on the robot; the wearer is warned."""
     STANDS_UP = 2
     """It stands up by itself; height and pitch are not the person's."""
     RESTS = 3

@@ -18,7 +18,6 @@ import socket
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Final
 
-from shared import log
 from shared.bus import sockets, topics
 from shared.bus.credentials import held_names, keys_folder, read_credentials
 from shared.config.endpoints import host_and_port
@@ -102,22 +101,11 @@ def listener(endpoint: str) -> str:
     return f"{endpoint}#tls_handshake_timeout_ms={HANDSHAKE_MS}" if of_tls else endpoint
 
 
-def allow_robots_hosts(robot: RobotConfig, listening: Sequence[str]) -> None:
-    """Under `mtls`, have this process hear the hosts of the endpoints and of `allow` only.
-
-    A host whose name is not known now is left out, with a warning: only its own link fails.
-    Raises BusError if the kernel takes no filter.
-    """
-    if robot.bus.security.mode != "mtls":
-        return
-    hosts = {host_and_port(endpoint)[0] for endpoint in robot.bus.endpoints.values()}
-    ports = {host_and_port(each)[1] for each in listening if each.startswith(TCP)}
-    if not ports:
-        return
-    addresses, unknown = sockets.resolved([*hosts, *robot.bus.security.allow])
-    for name in unknown:
-        log.get("xrl").warning("%s: no such host now; what comes from it is dropped", name)
-    sockets.restrict(ports, addresses)
+def limit_queues(robot: RobotConfig, listening: Sequence[str]) -> None:
+    """Under `mtls`, let this process's ports accept one waiting connection at a time."""
+    if robot.bus.security.mode == "mtls":
+        ports = {host_and_port(each)[1] for each in listening if each.startswith(TCP)}
+        sockets.shorten_queues(ports)
 
 
 # ---- access rules
@@ -250,8 +238,7 @@ def ports_here(robot: RobotConfig) -> frozenset[int]:
 
 def _is_own(endpoint: str) -> bool:
     """Return True if an endpoint's host is this one. Nothing is sent."""
-    addresses, _ = sockets.resolved([host_and_port(endpoint)[0]])
-    return any(map(_is_own_address, addresses))
+    return any(map(_is_own_address, sockets.addresses_of(host_and_port(endpoint)[0])))
 
 
 def _is_own_address(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:

@@ -291,7 +291,7 @@ class Session:
         """Declare a subscriber that keeps every sample, up to `capacity` per expression.
 
         Expressions are full keys, or with wildcards such as `xrl/lab/joint/*/state`; a key that
-        fits two of them comes twice. Raises BusError for one that is none.
+        fits two of them comes twice. Raises BusError for a malformed one.
         """
         try:
             return Stream([_ring(self._session, key, capacity) for key in key_expressions])
@@ -328,8 +328,7 @@ class Session:
     def is_linked(self, endpoint: str) -> bool:
         """Return True if there is a link with tls/HOST:PORT."""
         host, port = host_and_port(endpoint)
-        addresses, _ = sockets.resolved([host])
-        return any((str(address), port) in self._linked for address in addresses)
+        return any((str(address), port) in self._linked for address in sockets.addresses_of(host))
 
     def _meet(self, event: zenoh.LinkEvent) -> None:
         if not event.link.src.startswith(security.TCP):
@@ -424,11 +423,7 @@ def open_session(
         session = Session(opened, config.name, name, over_tcp=over_tcp)
     except (zenoh.ZError, OSError) as error:
         raise _open_error(name, listening, error) from None
-    try:
-        security.allow_robots_hosts(config, listening)
-    except BusError:
-        session.close()
-        raise
+    security.limit_queues(config, listening)
     if config.bus.security.mode == "mtls":
         _look_after_links(session, config, name, dict(zip(peers, dialling, strict=False)))
     return session

@@ -1,110 +1,41 @@
 """TCP sockets of this process and this host, by the kernel (Linux): Zenoh keeps its own to itself.
 
-Who may begin a link, and how many wait: a TLS listener of Zenoh sleeps for 100 ms after each failed
-handshake, so a stranger who can reach its port keeps new links off. It also takes in all that wait
-meanwhile, each with a descriptor: 640 connections a second that said nonsense left 4700 open in a
-minute. With a queue of one it takes in no more than it ends. The kernel drops the packets of
-addresses that are not allowed before there is a connection. A process may filter its own sockets
-without privilege (socket(7), SO_ATTACH_FILTER); links inherit the filter.
+A TLS listener of Zenoh sleeps for 100 ms after each failed handshake. It also accepts all
+connections that wait meanwhile, each with a descriptor: 640 bad connections a second left 4700
+open in a minute. With a queue of one it accepts no more than it ends. Which addresses reach the
+ports at all is for the firewall (`deploy/nftables`).
 
-Zenoh tells nobody of a handshake that fails. A flood shows in the connections that the kernel turns
+Zenoh does not report a handshake that fails. A flood shows in the connections that the kernel turns
 away because a listener's queue is full, and in who begins others (`Arrivals`).
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import ipaddress
 import re
 import socket
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from shared.clock import NS_PER_S
-from shared.exceptions import BusError
 
 IpAddress: TypeAlias = "ipaddress.IPv4Address | ipaddress.IPv6Address"
 Address = tuple[str, int]
 """Numeric host and port."""
 
-ADDRESSES_MAX: Final = 64
-"""Per address family; the kernel takes programs of 4096 instructions."""
-
-_SO_ATTACH_FILTER: Final = 26
-# Classic BPF, <linux/bpf_common.h> and <linux/filter.h>
-_LOAD_WORD, _LOAD_BYTE, _AND, _JUMP, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x30, 0x54, 0x05, 0x15, 0x06
 _SYN_COOKIES: Final = Path("/proc/sys/net/ipv4/tcp_syncookies")
-_NETWORK_HEADER: Final = 0xFFF00000
-"""SKF_NET_OFF: where an IP header begins, seen from any protocol."""
-_SOURCE_4, _SOURCE_6 = 12, 8
-_WHOLE: Final = 0xFFFFFFFF
-_INSTRUCTION: Final = struct.Struct("HBBI")
-_PROGRAM: Final = struct.Struct("HP")
 _RESET: Final = struct.pack("ii", 1, 0)
 
 
-class Instruction(NamedTuple):
-    """One instruction of classic BPF."""
-
-    code: int
-    if_true: int
-    if_false: int
-    value: int
-
-
-_KEEP: Final = Instruction(_RETURN, 0, 0, _WHOLE)
-_DROP: Final = Instruction(_RETURN, 0, 0, 0)
-
-
-def program(allowed: Collection[IpAddress]) -> list[Instruction]:
-    """Return a filter that keeps the packets of these source addresses and drops all others.
-
-    Raises BusError if there are more addresses than it takes.
-    """
-    four = [address for address in allowed if isinstance(address, ipaddress.IPv4Address)]
-    six = [address for address in allowed if isinstance(address, ipaddress.IPv6Address)]
-    if max(len(four), len(six)) > ADDRESSES_MAX:
-        raise BusError(f"bus.security.allow: over {ADDRESSES_MAX} addresses")
-    for_four = [Instruction(_LOAD_WORD, 0, 0, _NETWORK_HEADER + _SOURCE_4)]
-    for address in four:
-        for_four += [Instruction(_JUMP_IF_EQUAL, 0, 1, int(address)), _KEEP]
-    for_four.append(_DROP)
-    for_six: list[Instruction] = []
-    for each in six:
-        words = struct.unpack(">4I", each.packed)
-        for index, word in enumerate(words):
-            left = 2 * (len(words) - index - 1) + 1  # to the instruction after this address's
-            load = Instruction(_LOAD_WORD, 0, 0, _NETWORK_HEADER + _SOURCE_6 + 4 * index)
-            for_six += [load, Instruction(_JUMP_IF_EQUAL, 0, left, word)]
-        for_six.append(_KEEP)
-    for_six.append(_DROP)
-    return [
-        Instruction(_LOAD_BYTE, 0, 0, _NETWORK_HEADER),
-        Instruction(_AND, 0, 0, 0xF0),
-        Instruction(_JUMP_IF_EQUAL, 1, 0, 0x40),  # over the jump: IPv4
-        Instruction(_JUMP, 0, 0, len(for_four)),
-        *for_four,
-        *for_six,
-    ]
-
-
-def restrict(ports: Collection[int], allowed: Collection[IpAddress]) -> None:
-    """Have this process's listening sockets at these ports hear allowed addresses, one at a time.
-
-    Raises BusError if nothing listens at one of the ports, or the kernel takes no filter.
-    """
-    code, left = program(allowed), set(ports)
+def shorten_queues(ports: Collection[int]) -> None:
+    """Let this process's listeners at these ports accept one waiting connection at a time."""
     for own in _own_sockets():
-        port = _listening_port(own)
-        if port in ports:
-            _attach(own, code)
-            left.discard(port)
-    if left:
-        raise BusError(f"no filter of addresses for mtls: nothing listens at {sorted(left)}")
+        if _listening_port(own) in ports:
+            own.listen(_waiting_max())
 
 
 def reset_on_close(local: Address, remote: Address) -> bool:
@@ -123,21 +54,13 @@ def reset_on_close(local: Address, remote: Address) -> bool:
     return False
 
 
-def resolved(hosts: Iterable[str]) -> tuple[set[IpAddress], list[str]]:
-    """Return the addresses of hosts, and the hosts that are not known.
-
-    A name lookup may block: at the start only.
-    """
-    found: set[IpAddress] = set()
-    unknown = []
-    for host in hosts:
-        try:
-            rows = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
-        except (OSError, UnicodeError):
-            unknown.append(host)
-        else:
-            found |= {ipaddress.ip_address(row[4][0]) for row in rows}
-    return found, unknown
+def addresses_of(host: str) -> set[IpAddress]:
+    """Return the addresses of a host, none if its name is unknown. A name lookup may block."""
+    try:
+        rows = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return set()
+    return {ipaddress.ip_address(row[4][0]) for row in rows}
 
 
 def _own_sockets() -> Iterator[socket.socket]:
@@ -161,16 +84,6 @@ def _listening_port(own: socket.socket) -> int | None:
         if own.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
             return int(own.getsockname()[1])
     return None
-
-
-def _attach(listener: socket.socket, code: list[Instruction]) -> None:
-    text = ctypes.create_string_buffer(b"".join(_INSTRUCTION.pack(*row) for row in code))
-    packed = _PROGRAM.pack(len(code), ctypes.addressof(text))
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
-        listener.listen(_waiting_max())
-    except OSError as error:
-        raise BusError(f"no filter of addresses for mtls: {error.strerror}") from None
 
 
 def _waiting_max() -> int:

@@ -109,7 +109,7 @@ class LinkWatch:
         threading.Thread(target=self._run, daemon=True, name="link-watch").start()
 
     def end(self) -> None:
-        """Look no more; what is being tried ends by itself."""
+        """Stop the watch; a probe that runs ends by itself."""
         self._ended.set()
 
     def _run(self) -> None:

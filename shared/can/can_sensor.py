@@ -8,7 +8,7 @@ from typing import Final, Generic, TypeVar
 
 import can
 
-from shared.can.frame_group import FrameGroup
+from shared.can.sensor_frames import FrameGroup
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import HarnessConfig, ImuConfig

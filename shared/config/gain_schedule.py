@@ -20,8 +20,7 @@ from shared.config.gain_table import GainSchedule, ModuleBounds
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.joints import KINDS, MODULES, kind_of
-from shared.text_file import read_text
-from shared.toml_file import check_ranges
+from shared.toml_file import check_ranges, read_text
 
 VERSION = 2
 """Version of the file and of the program that makes it; a file of another version is made again."""

@@ -27,7 +27,7 @@ class MassConfig(Section, frozen=True):
     payload_max: Mass
     """The largest `payload` that the file may name."""
     payload_com: tuple[PayloadPlace, PayloadPlace, PayloadPlace] = (0.0, 0.0, 0.0)
-    """Centre of the payload, m, torso axes, from the torso's origin: `xrl drive identify`."""
+    """Centre of the payload, m, torso axes, from the torso's origin."""
 
 
 class GeometryConfig(Section, frozen=True):

@@ -9,17 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from services.harness.filter import WrenchFilter
-from services.harness.loop import HarnessLoop
-from services.harness.zero_file import ZeroFile
+from services.harness.loop import HarnessLoop, ZeroFile
 from shared.bus.codec import encode
 from shared.bus.messages import TareRequest, Vector6, Wrench
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config import files as config_file
 from shared.config.sections import HarnessConfig
-from shared.places import DEFAULT_CONFIG
 from shared.robot.stewart import geometry_matrix
+from tests.robots import ROBOT
 
-ROBOT = config_file.load(DEFAULT_CONFIG)
 HARNESS = ROBOT.harness
 G = geometry_matrix(HARNESS.base_radius, HARNESS.platform_radius, HARNESS.height)
 PERIOD_NS = 4 * NS_PER_MS

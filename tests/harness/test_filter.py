@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ from services.harness.filter import (
     start_tare,
 )
 from shared.bus.messages import Tare
-from shared.can.loadcell_can import as_sent
+from shared.can.sensor_frames import as_sent
 from shared.clock import NS_PER_MS, NS_PER_S
 from tests.harness.helpers import (
     HARNESS,
@@ -28,103 +29,93 @@ from tests.harness.helpers import (
     harness_with,
     legs,
     six,
-)  # fmt: skip
+)
 
-Array = npt.NDArray[np.float64]
 LAW = WrenchFilter(HARNESS)
 STALE_NS = round(HARNESS.stale_ms * NS_PER_MS)
 TARE_NS = round(HARNESS.tare_s * NS_PER_S)
 LIMIT = HARNESS.leg_force_max
-
-biases = st.tuples(*[st.floats(-200.0, 200.0)] * 6)
-
-
-def feed(
-    law: WrenchFilter, state: FilterState, t_ns: int, forces: tuple[float, ...]
-) -> tuple[FilterState, FilteredWrench]:
-    return law.step(state, t_ns, six(forces))
+Forces = Sequence[float] | npt.NDArray[np.float64]
 
 
-def tared(law: WrenchFilter = LAW, bias: tuple[float, ...] = ZERO) -> tuple[FilterState, int]:
-    """Return a state after the tare, and the time of its last sample."""
-    state, t_ns = FilterState(), T0
-    while True:
-        state, reading = feed(law, state, t_ns, bias)
-        if reading.valid:
-            return state, t_ns
-        assert t_ns < T0 + 10 * NS_PER_S
-        t_ns += PERIOD_NS
+class Fed:
+    """A filter that is fed with forces; the first come at T0."""
+
+    def __init__(self, law: WrenchFilter = LAW, bias: Forces | None = ZERO) -> None:
+        """Feed a bias until the tare is done, or nothing."""
+        self.law, self.state, self.t_ns = law, FilterState(), T0 - PERIOD_NS
+        while bias is not None and not self.feed(bias).valid:
+            assert self.t_ns < T0 + 10 * NS_PER_S
+
+    def feed(self, forces: Forces, after_ns: int = PERIOD_NS) -> FilteredWrench:
+        self.t_ns += after_ns
+        self.state, reading = self.law.step(self.state, self.t_ns, six(forces))
+        return reading
+
+    def settle(self, forces: Forces) -> FilteredWrench:
+        """Feed constant forces for 0.5 s: 20 time constants of the low-pass and more."""
+        return [self.feed(forces) for _ in range(125)][-1]
+
+    def look(self, after_ns: int = 0) -> FilteredWrench:
+        """Read without a sample, some time after the last."""
+        self.state, reading = self.law.step(self.state, self.t_ns + after_ns, None)
+        return reading
 
 
-def settled(
-    law: WrenchFilter, state: FilterState, t_ns: int, forces: tuple[float, ...]
-) -> tuple[FilterState, FilteredWrench, int]:
-    """Feed constant forces for 0.5 s: 20 time constants of the low-pass and more."""
-    reading = law.step(state, t_ns, None)[1]
-    for _ in range(125):
-        t_ns += PERIOD_NS
-        state, reading = feed(law, state, t_ns, forces)
-    return state, reading, t_ns
+def only(leg: int, force: float) -> list[float]:
+    return [force if each == leg else 0.0 for each in range(6)]
 
 
-def test_nothing_is_valid_before_the_first_sample() -> None:
-    state, reading = LAW.step(FilterState(), T0, None)
-    assert (reading.valid, reading.age_ns) == (False, -1)
-    assert not reading.wrench.any()
-    assert state.tare is not Tare.DONE
+def x(newtons: float) -> Forces:
+    return legs((newtons, 0, 0, 0, 0, 0))
 
 
 def test_valid_comes_exactly_when_the_tare_time_is_full() -> None:
-    state = FilterState()
-    for t_ns in range(T0, T0 + TARE_NS, PERIOD_NS):
-        state, reading = feed(LAW, state, t_ns, ZERO)
-        assert not reading.valid
-    before, reading = feed(LAW, state, T0 + TARE_NS - 1, ZERO)
-    assert not reading.valid
-    _, reading = feed(LAW, before, T0 + TARE_NS, ZERO)
-    assert reading.valid
+    fed = Fed(bias=None)
+    nothing = fed.look()
+    assert (nothing.valid, nothing.age_ns, nothing.wrench.any()) == (False, -1, False)
+    assert not any(fed.feed(ZERO).valid for _ in range(0, TARE_NS, PERIOD_NS))
+    left_ns = T0 + TARE_NS - fed.t_ns
+    assert not fed.feed(ZERO, left_ns - 1).valid
+    assert fed.feed(ZERO, 1).valid
 
 
 @settings(max_examples=30)
-@given(bias=biases, wrench=st.tuples(*[st.floats(-40.0, 40.0)] * 6))
+@given(
+    bias=st.tuples(*[st.floats(-200.0, 200.0)] * 6), wrench=st.tuples(*[st.floats(-40.0, 40.0)] * 6)
+)
 def test_tare_removes_any_constant_bias(
     bias: tuple[float, ...], wrench: tuple[float, ...]
 ) -> None:  # fmt: skip
-    state, t_ns = tared(bias=bias)
-    loaded = tuple(np.add(bias, legs(wrench)))
-    _, reading, _ = settled(LAW, state, t_ns, loaded)
+    reading = Fed(bias=bias).settle(np.add(bias, legs(wrench)))
     assert reading.valid
     np.testing.assert_allclose(reading.wrench, wrench, atol=1e-6)
 
 
-def test_tare_averages_noise() -> None:
-    noise = np.random.default_rng(1).standard_normal((200, 6))
-    state, t_ns, used = FilterState(), T0, 0
-    while state.tare is not Tare.DONE:
-        state, _ = feed(LAW, state, t_ns, tuple(50.0 + noise[used]))
-        used += 1
-        t_ns += PERIOD_NS
-    np.testing.assert_allclose(state.offset, 50.0 + noise[:used].mean(axis=0))
+def test_tare_averages_noise_and_a_gap_of_just_the_stale_time_does_not_disturb_it() -> None:
+    noise = 50.0 + np.random.default_rng(1).standard_normal((200, 6))
+    for gap_ns in (PERIOD_NS, STALE_NS):
+        fed, used = Fed(bias=None), 0
+        while fed.state.tare is not Tare.DONE:
+            fed.feed(noise[used], gap_ns if used else PERIOD_NS)
+            used += 1
+        np.testing.assert_allclose(fed.state.offset, noise[:used].mean(axis=0))
+        assert fed.t_ns == T0 + TARE_NS
 
 
 @pytest.mark.parametrize("disturbance", ["gap", "saturation"])
 def test_a_disturbed_tare_starts_over_and_forgets_what_it_had(disturbance: str) -> None:
-    state, t_ns = FilterState(), T0
+    fed = Fed(bias=None)
     for _ in range(100):
-        state, _ = feed(LAW, state, t_ns, (100.0,) * 6)
-        t_ns += PERIOD_NS
-    if disturbance == "gap":
-        t_ns += STALE_NS
-    else:
-        state, reading = feed(LAW, state, t_ns, (LIMIT,) * 6)
-        assert reading.saturated
-        t_ns += PERIOD_NS
-    begun_ns = t_ns
-    while state.tare is not Tare.DONE:
-        state, reading = feed(LAW, state, t_ns, (7.0,) * 6)
-        t_ns += PERIOD_NS
-    assert t_ns - PERIOD_NS - begun_ns >= TARE_NS
-    np.testing.assert_allclose(state.offset, 7.0)
+        fed.feed((100.0,) * 6)
+    if disturbance == "saturation":
+        assert fed.feed((LIMIT,) * 6).saturated
+    fed.feed((7.0,) * 6, PERIOD_NS + STALE_NS if disturbance == "gap" else PERIOD_NS)
+    begun_ns = fed.t_ns
+    while fed.state.tare is not Tare.DONE:
+        reading = fed.feed((7.0,) * 6)
+    assert fed.t_ns - begun_ns >= TARE_NS
+    np.testing.assert_allclose(fed.state.offset, 7.0)
     assert reading.valid
 
 
@@ -132,102 +123,64 @@ def test_a_disturbed_tare_starts_over_and_forgets_what_it_had(disturbance: str) 
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_tare_is_taken_up_to_the_limit_of_the_forces_deviation(leg: int, share: float) -> None:
     """Alternating between two values, the deviation is half their distance, whatever the bias."""
-    state, t_ns = FilterState(), T0
+    fed, jump = Fed(bias=None), 2.0 * share * TARE_DEVIATION_MAX
     for n in range(TARE_CYCLES + 1):
-        forces = [1000.0] * 6
-        forces[leg] += 2.0 * share * TARE_DEVIATION_MAX * (n % 2)
-        state, reading = feed(LAW, state, t_ns, tuple(forces))
-        t_ns += PERIOD_NS
+        reading = fed.feed(np.add(1000.0, only(leg, jump * (n % 2))))
     assert reading.valid is (share < 1.0)
-    assert state.tare is (Tare.DONE if share < 1.0 else Tare.UNSTEADY)
-
-
-def test_a_gap_of_just_the_stale_time_does_not_disturb_the_tare() -> None:
-    state, t_ns = FilterState(), T0
-    while state.tare is not Tare.DONE:
-        state, _ = feed(LAW, state, t_ns, ZERO)
-        t_ns += STALE_NS
-    assert t_ns - STALE_NS == T0 + TARE_NS
+    assert fed.state.tare is (Tare.DONE if share < 1.0 else Tare.UNSTEADY)
 
 
 def test_tare_can_be_started_again_and_keeps_the_last_wrench_meanwhile() -> None:
-    state, t_ns = tared()
-    state, before, t_ns = settled(LAW, state, t_ns, legs((10.0, 0, 0, 0, 0, 0)))
-    state = start_tare(state)
-    state, reading = LAW.step(state, t_ns, None)
+    fed = Fed()
+    before = fed.settle(x(10.0))
+    fed.state = start_tare(fed.state)
+    reading, seen_invalid = fed.look(), 0
     assert not reading.valid
-    seen_invalid = 0
-    while state.tare is not Tare.DONE:
+    while fed.state.tare is not Tare.DONE:
         np.testing.assert_array_equal(reading.wrench, before.wrench)
-        t_ns += PERIOD_NS
-        state, reading = feed(LAW, state, t_ns, legs((30.0, 0, 0, 0, 0, 0)))
+        reading = fed.feed(x(30.0))
         seen_invalid += not reading.valid
     assert seen_invalid >= TARE_NS // PERIOD_NS
     assert reading.valid
     assert not reading.wrench.any(), "what was there during the tare is now zero"
-    _, reading, _ = settled(LAW, state, t_ns, legs((31.0, 0, 0, 0, 0, 0)))
-    assert reading.wrench[0] == pytest.approx(1.0, abs=1e-6)
+    assert fed.settle(x(31.0)).wrench[0] == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("low_pass_hz", [1.0, 10.0, 40.0, 100.0])
 @pytest.mark.parametrize("period_ns", [NS_PER_MS, 4 * NS_PER_MS, 7_123_457])
 def test_step_response_is_the_analytic_one(low_pass_hz: float, period_ns: int) -> None:
-    law = WrenchFilter(harness_with(low_pass_hz=low_pass_hz))
-    state, begun_ns = tared(law)
+    fed = Fed(WrenchFilter(harness_with(low_pass_hz=low_pass_hz)))
     wrench = np.array([20.0, -10.0, 30.0, 1.0, -2.0, 3.0])
-    forces = legs(wrench)
     for n in range(1, 60):
-        t_ns = begun_ns + n * period_ns
-        state, reading = feed(law, state, t_ns, forces)
+        reading = fed.feed(legs(wrench), period_ns)
         share = 1.0 - math.exp(-2.0 * math.pi * low_pass_hz * n * period_ns / NS_PER_S)
         np.testing.assert_allclose(reading.wrench, share * wrench, atol=1e-9)
 
 
 @given(cuts=st.lists(st.integers(1, 19 * NS_PER_MS), min_size=1, max_size=8))
 def test_step_response_does_not_depend_on_when_samples_come(cuts: list[int]) -> None:
-    state, t_ns = tared()
-    begun_ns = t_ns
-    forces = legs((20.0, 0, 0, 0, 0, 0))
-    for cut in cuts:
-        t_ns += cut
-        state, reading = feed(LAW, state, t_ns, forces)
-    elapsed = (t_ns - begun_ns) / NS_PER_S
-    expected = 20.0 * (1.0 - math.exp(-2.0 * math.pi * HARNESS.low_pass_hz * elapsed))
-    assert reading.wrench[0] == pytest.approx(expected, abs=1e-9)
-
-
-def test_a_sample_seen_twice_or_out_of_order_does_not_move_the_wrench() -> None:
-    state, t_ns = tared()
-    state, before = feed(LAW, state, t_ns + PERIOD_NS, legs((20.0, 0, 0, 0, 0, 0)))
-    for again_ns in (t_ns + PERIOD_NS, t_ns):
-        _, reading = feed(LAW, state, again_ns, legs((999.0, 0, 0, 0, 0, 0)))
-        np.testing.assert_array_equal(reading.wrench, before.wrench)
+    fed = Fed()
+    reading = [fed.feed(x(20.0), cut) for cut in cuts][-1]
+    share = 1.0 - math.exp(-2.0 * math.pi * HARNESS.low_pass_hz * sum(cuts) / NS_PER_S)
+    assert reading.wrench[0] == pytest.approx(20.0 * share, abs=1e-9)
 
 
 LAST_BELOW = float(np.nextafter(np.float32(LIMIT), np.float32(0)))
-LEVELS = (
-    *((level, False) for level in (0.0, 0.5 * LIMIT, LIMIT - 1.0, LAST_BELOW)),
-    *((level, True) for level in (LIMIT, math.nextafter(LIMIT, math.inf), LIMIT + 1.0, 3e38)),
-)
+BELOW = (0.0, 0.5 * LIMIT, LIMIT - 1.0, LAST_BELOW)
+BEYOND = (LIMIT, math.nextafter(LIMIT, math.inf), LIMIT + 1.0, 3e38)
 
 
 @pytest.mark.parametrize("leg", range(6))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(("level", "saturated"), LEVELS)
+@pytest.mark.parametrize("level", BELOW + BEYOND)
 def test_saturation_is_reported_of_any_leg_at_the_limit_and_not_below(
-    leg: int, sign: float, level: float, saturated: bool
+    leg: int, sign: float, level: float
 ) -> None:
-    state, t_ns = tared()
-    state, before, t_ns = settled(LAW, state, t_ns, legs((20.0, 0, 5.0, 0, 1.0, 0)))
-    forces = [0.0] * 6
-    forces[leg] = sign * level
-    _, reading = feed(LAW, state, t_ns + PERIOD_NS, tuple(forces))
-    assert reading.saturated is saturated
-    assert reading.valid is not saturated
-    if saturated:
-        np.testing.assert_array_equal(reading.wrench, before.wrench)
-    else:
-        assert (reading.wrench != before.wrench).any()
+    fed = Fed()
+    before = fed.settle(legs((20.0, 0, 5.0, 0, 1.0, 0)))
+    reading = fed.feed(only(leg, sign * level))
+    assert (reading.saturated, reading.valid) == (level in BEYOND, level not in BEYOND)
+    assert np.array_equal(reading.wrench, before.wrench) is reading.saturated
 
 
 @given(limit=st.floats(1.0, 1e5))
@@ -235,46 +188,36 @@ def test_a_cell_at_the_end_of_its_range_is_saturated_whatever_float32_makes_of_i
     limit: float,
 ) -> None:
     law = WrenchFilter(harness_with(leg_force_max=limit))
-    _, reading = feed(law, FilterState(), T0, (as_sent(limit), *ZERO[1:]))
-    assert reading.saturated
+    assert Fed(law, bias=None).feed(only(0, as_sent(limit))).saturated
 
 
-def test_saturation_is_judged_before_the_tare_is_taken_off() -> None:
-    bias = (LIMIT - 10.0,) * 6
-    state, t_ns = tared(bias=bias)
-    _, reading = feed(LAW, state, t_ns + PERIOD_NS, (LIMIT, *bias[1:]))
-    assert reading.saturated
+def test_saturation_is_judged_before_the_tare_and_ends_with_the_first_sample_below_it() -> None:
+    for level in (0.0, LIMIT - 10.0):
+        fed = Fed(bias=(level,) * 6)
+        assert fed.feed((LIMIT, *[level] * 5)).saturated
+        reading = fed.look(1)
+        assert (reading.saturated, reading.valid) == (True, False)
+        reading = fed.feed((level,) * 6)
+        assert (reading.saturated, reading.valid) == (False, True)
 
 
-def test_validity_returns_with_the_first_sample_below_the_limit() -> None:
-    state, t_ns = tared()
-    state, _ = feed(LAW, state, t_ns + PERIOD_NS, (LIMIT,) * 6)
-    state, reading = LAW.step(state, t_ns + PERIOD_NS + 1, None)
-    assert reading.saturated
-    assert not reading.valid
-    _, reading = feed(LAW, state, t_ns + 2 * PERIOD_NS, ZERO)
-    assert reading.valid
-    assert not reading.saturated
-
-
-@pytest.mark.parametrize(
-    ("age_ns", "valid"),
-    [(0, True), (1, True), (STALE_NS // 2, True), (STALE_NS - 1, True), (STALE_NS, True),
-     (STALE_NS + 1, False), (STALE_NS + NS_PER_MS, False), (100 * STALE_NS, False), (-1, False)],
-)  # fmt: skip
-def test_a_sample_is_usable_up_to_the_stale_age_and_not_beyond(age_ns: int, valid: bool) -> None:
-    state, t_ns = tared()
-    _, reading = LAW.step(state, t_ns + age_ns, None)
-    assert (reading.valid, reading.age_ns) == (valid, age_ns)
+def test_a_sample_is_usable_up_to_the_stale_age_and_not_beyond() -> None:
+    fed = Fed()
+    for age_ns in (-1, 0, 1, STALE_NS // 2, STALE_NS - 1, STALE_NS, STALE_NS + 1, 100 * STALE_NS):
+        reading = fed.look(age_ns)
+        assert (reading.valid, reading.age_ns) == (0 <= age_ns <= STALE_NS, age_ns)
 
 
 def test_the_last_good_wrench_is_kept_while_stale_and_replaced_by_the_next_sample() -> None:
-    state, t_ns = tared()
-    state, before, t_ns = settled(LAW, state, t_ns, legs((20.0, 0, 0, 0, 0, 0)))
-    state, reading = LAW.step(state, t_ns + NS_PER_S, None)
+    """A sample seen twice or out of order does not move it."""
+    fed = Fed()
+    before = fed.settle(x(20.0))
+    for again_ns in (0, -PERIOD_NS):
+        np.testing.assert_array_equal(fed.feed(x(999.0), again_ns).wrench, before.wrench)
+    reading = fed.look(NS_PER_S)
     assert not reading.valid
     np.testing.assert_array_equal(reading.wrench, before.wrench)
-    _, reading = feed(LAW, state, t_ns + NS_PER_S, legs((0, 9.0, 0, 0, 0, 0)))
+    reading = fed.feed(legs((0, 9.0, 0, 0, 0, 0)), NS_PER_S)
     assert reading.valid
     np.testing.assert_allclose(reading.wrench, [0, 9.0, 0, 0, 0, 0], atol=1e-9)
 
@@ -285,26 +228,21 @@ def test_the_last_good_wrench_is_kept_while_stale_and_replaced_by_the_next_sampl
 def test_a_force_that_is_not_finite_is_refused_and_counted(
     leg: int, number: float, taring: bool
 ) -> None:
-    state, t_ns = tared()
+    fed = Fed()
     if taring:
-        state, _ = feed(LAW, start_tare(state), t_ns, ZERO)
-    forces = [0.0] * 6
-    forces[leg] = number
-    after, reading = feed(LAW, state, t_ns + PERIOD_NS, tuple(forces))
-    assert after.refused == state.refused + 1
-    assert reading.age_ns == PERIOD_NS, "it counts as no sample"
-    assert np.isfinite(after.wrench).all()
-    assert np.isfinite(after.tare_sum).all()
+        fed.state = start_tare(fed.state)
+        fed.feed(ZERO, 0)
+    refused = fed.state.refused
+    assert fed.feed(only(leg, number)).age_ns == PERIOD_NS, "it counts as no sample"
+    assert fed.state.refused == refused + 1
+    assert np.isfinite([fed.state.wrench, fed.state.tare_sum]).all()
+
+
+samples = st.none() | st.tuples(*[st.floats(width=32)] * 6)
 
 
 @given(
-    stream=st.lists(
-        st.tuples(
-            st.integers(0, 40 * NS_PER_MS),
-            st.one_of(st.none(), st.tuples(*[st.floats(width=32)] * 6)),
-        ),
-        max_size=40,
-    ),
+    stream=st.lists(st.tuples(st.integers(0, 40 * NS_PER_MS), samples), max_size=40),
     tare_ms=st.sampled_from([1.0, 20.0]),
 )
 def test_whatever_the_sensor_sends_the_reading_is_finite(
@@ -323,18 +261,17 @@ def test_whatever_the_sensor_sends_the_reading_is_finite(
 
 
 def test_a_step_changes_neither_the_state_nor_the_reading_before_it() -> None:
-    state, t_ns = tared()
-    later, first = feed(LAW, state, t_ns + PERIOD_NS, (10.0,) * 6)
-    kept = first.wrench.copy()
-    feed(LAW, later, t_ns + 2 * PERIOD_NS, (500.0,) * 6)
+    fed = Fed()
+    state, at_ns = fed.state, fed.t_ns
+    first = fed.feed((10.0,) * 6)
+    later, kept = fed.state, first.wrench.copy()
+    fed.feed((500.0,) * 6)
     np.testing.assert_array_equal(first.wrench, kept)
-    again, repeated = feed(LAW, state, t_ns + PERIOD_NS, (10.0,) * 6)
-    np.testing.assert_array_equal(repeated.wrench, kept)
-    assert again.wrench_t_ns == later.wrench_t_ns
+    fed.state, fed.t_ns = state, at_ns
+    np.testing.assert_array_equal(fed.feed((10.0,) * 6).wrench, kept)
+    assert fed.state.wrench_t_ns == later.wrench_t_ns
 
 
 def test_the_wrench_is_the_geometry_matrix_times_the_leg_forces() -> None:
-    state, t_ns = tared()
     forces = (10.0, -20.0, 30.0, -40.0, 50.0, -60.0)
-    _, reading, _ = settled(LAW, state, t_ns, forces)
-    np.testing.assert_allclose(reading.wrench, G @ forces, atol=1e-9)
+    np.testing.assert_allclose(Fed().settle(forces).wrench, G @ forces, atol=1e-9)

@@ -8,18 +8,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from services.harness.zero_file import ZeroFile, path_of
+from services.harness.loop import ZeroFile, zero_path
 from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from shared.bus.codec import Decoder
 from shared.bus.messages import Tare, Wrench
 from shared.can.can_sensor import sensor_of
-from shared.can.loadcell_can import SampleAssembler
+from shared.can.sensor_frames import SampleAssembler
 from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig
 from tests.harness.helpers import (
     HARNESS,
     PERIOD_NS,
-    ROBOT,
     T0,
     TARE_CYCLES,
     ZERO,
@@ -30,6 +29,7 @@ from tests.harness.helpers import (
     make_loop,
     six,
 )  # fmt: skip
+from tests.robots import ROBOT
 
 
 class FrameList:
@@ -51,17 +51,20 @@ class FrameList:
 
 
 def test_every_cycle_publishes_once_with_the_next_sequence_number() -> None:
-    loop, _, sink = make_loop()
-    cycles(loop, T0, 10)
+    """A tare that is asked for in each of them is not delayed by that."""
+    asked = Asked()
+    loop, _, sink = make_loop(asked)
+    for n in range(TARE_CYCLES + 1):
+        asked.asked = True
+        message = loop.cycle(T0 + n * PERIOD_NS)
+    assert message.valid
     decoder = Decoder(Wrench)
     messages = [decoder.decode(payload) for payload in sink.payloads]
     stamps = [(m.seq, m.t_ns) for m in messages if m is not None]
-    assert stamps == [(n, T0 + n * PERIOD_NS) for n in range(10)]
+    assert stamps == [(n, T0 + n * PERIOD_NS) for n in range(TARE_CYCLES + 1)]
 
 
-def test_a_tare_on_request_makes_the_present_wrench_the_zero_and_is_reported_until_it_is_done() -> (
-    None
-):
+def test_a_tare_on_request_makes_the_present_wrench_the_zero_and_is_reported_until_then() -> None:
     asked = Asked()
     loop, sensor, _ = make_loop(asked)
     _, t_ns = cycles(loop, T0, TARE_CYCLES + 1)
@@ -113,7 +116,7 @@ def test_a_zero_that_is_damaged_or_of_an_earlier_boot_is_none(tmp_path: Path) ->
     zero.write(offset)
     assert np.array_equal(ZeroFile(tmp_path).read(), offset)
     assert ZeroFile(tmp_path, b"another boot").read() is None
-    file = path_of(tmp_path)
+    file = zero_path(tmp_path)
     whole = file.read_bytes()
     for at in range(len(whole)):
         file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
@@ -122,16 +125,6 @@ def test_a_zero_that_is_damaged_or_of_an_earlier_boot_is_none(tmp_path: Path) ->
     zero = ZeroFile(tmp_path)
     zero.write(None)
     assert zero.read() is None
-
-
-def test_a_repeated_request_does_not_delay_the_running_tare() -> None:
-    asked = Asked()
-    loop, _, _ = make_loop(asked)
-    t_ns = T0
-    for _ in range(TARE_CYCLES + 1):
-        asked.asked = True
-        message, t_ns = cycles(loop, t_ns, 1)
-    assert message.valid
 
 
 def test_a_tare_that_shakes_is_reported_and_stays_invalid_until_it_is_still() -> None:
@@ -149,12 +142,6 @@ def test_a_tare_that_shakes_is_reported_and_stays_invalid_until_it_is_still() ->
     assert (message.valid, message.tare) == (True, Tare.DONE)
 
 
-def test_the_simulated_sensor_sends_three_frames_in_one_packet() -> None:
-    hub = FrameList()
-    HarnessFront(ROBOT, hub, seed=1).send([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])
-    assert [[can_id for can_id, _ in packet] for packet in hub.packets] == [[0x300, 0x301, 0x302]]
-
-
 def test_simulated_legs_carry_the_wrench_and_a_constant_bias_and_white_noise() -> None:
     hub = FrameList()
     front = HarnessFront(ROBOT, hub, seed=1)
@@ -169,13 +156,14 @@ def test_simulated_legs_carry_the_wrench_and_a_constant_bias_and_white_noise() -
     assert np.abs(front.bias).max() > 1.0, "without a bias the tare would have nothing to do"
 
 
-def test_the_simulated_sensor_is_the_same_for_the_same_seed_and_another_for_another() -> None:
+def test_the_simulated_sensor_sends_three_frames_in_one_packet_the_same_for_the_same_seed() -> None:
     packets = []
     for seed in (1, 1, 2):
         hub = FrameList()
         HarnessFront(ROBOT, hub, seed).send([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])
         packets.append(hub.packets)
     assert packets[0] == packets[1] != packets[2]
+    assert [[can_id for can_id, _ in packet] for packet in packets[0]] == [[0x300, 0x301, 0x302]]
 
 
 def test_the_simulated_cells_clip_and_the_service_calls_that_saturated() -> None:

@@ -61,16 +61,8 @@ def test_wrench_does_the_work_of_the_legs(leg_forces: Array) -> None:
         assert (G @ leg_forces)[axis] == pytest.approx(float(leg_forces @ shortening), abs=1e-4)
 
 
-def test_tension_pulls_the_torso_towards_the_operator() -> None:
-    force_x = (G @ np.ones(6))[0]
-    _, height = HARNESS.base_radius, HARNESS.height
-    base, platform = leg_points(*GEOMETRY)
-    length = math.dist(base[0], platform[0])
-    assert force_x == pytest.approx(6.0 * height / length)
-    np.testing.assert_allclose((G @ np.ones(6))[1:], 0.0, atol=1e-12)
-
-
 def test_layout_is_a_hexapod_with_six_equal_legs_that_do_not_cross() -> None:
+    """Their tension pulls the torso towards the operator."""
     base, platform = leg_points(*GEOMETRY)
     np.testing.assert_allclose(np.linalg.norm(base[:, 1:], axis=1), HARNESS.base_radius)
     np.testing.assert_allclose(np.linalg.norm(platform[:, 1:], axis=1), HARNESS.platform_radius)
@@ -80,10 +72,18 @@ def test_layout_is_a_hexapod_with_six_equal_legs_that_do_not_cross() -> None:
     for points in (base, platform):
         angles = np.unwrap(np.arctan2(points[:, 2], points[:, 1]))
         assert (np.diff(angles) > 0.0).all()
+    pull = G @ np.ones(6)
+    assert pull[0] == pytest.approx(6.0 * HARNESS.height / lengths[0])
+    np.testing.assert_allclose(pull[1:], 0.0, atol=1e-12)
 
 
 def test_the_robots_sensor_is_well_conditioned_and_takes_its_loads() -> None:
-    assert condition_number(G, HARNESS.platform_radius) < 3.0
+    """A condition number does not depend on the unit of length."""
+    in_m = condition_number(G, HARNESS.platform_radius)
+    assert in_m < 3.0
+    in_mm = geometry_matrix(*GEOMETRY)
+    in_mm[3:] *= 1e3
+    assert condition_number(in_mm, HARNESS.platform_radius * 1e3) == pytest.approx(in_m)
     assist_and_lead = np.array([0.0, 0.0, 350.0, 0.0, 60.0, 0.0])  # 200 N assist, 150 N hand
     assert np.abs(np.linalg.solve(G, assist_and_lead)).max() < HARNESS.leg_force_max
 
@@ -119,10 +119,3 @@ def test_a_geometry_that_is_not_refused_is_well_conditioned(
     except ConfigError:
         assume(False)
     assert condition_number(matrix, platform_radius) <= CONDITION_MAX
-
-
-def test_condition_number_does_not_depend_on_the_unit_of_length() -> None:
-    in_mm = geometry_matrix(*GEOMETRY)
-    in_mm[3:] *= 1e3
-    in_m = condition_number(G, HARNESS.platform_radius)
-    assert condition_number(in_mm, HARNESS.platform_radius * 1e3) == pytest.approx(in_m)

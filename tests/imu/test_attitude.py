@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from services.imu.attitude import FROZEN_NS, AttitudeLaw, up_in_sensor
 from services.imu.loop import ImuLoop
 from shared.bus.messages import Attitude, Vector4
-from shared.can.imu_can import ImuSample
+from shared.can.sensor_frames import ImuSample
 from shared.clock import NS_PER_MS
 from shared.config.sections import ImuConfig
 
@@ -46,15 +46,11 @@ def test_up_is_the_vertical_in_torso_axes_whatever_the_heading(
 @pytest.mark.parametrize(("late_ns", "valid"), [(0, True), (STALE_NS, True), (STALE_NS + 1, False)])
 def test_a_sample_is_good_up_to_its_age_and_the_numbers_stay(late_ns: int, valid: bool) -> None:
     law = AttitudeLaw(ROBOT_IMU)
+    nothing = law.step(T0, None)
+    assert (nothing.valid, nothing.age_ns) == (False, -1), "before the first"
     first = law.step(T0, sample(Rotation.from_euler("X", 0.1)))
     later = law.step(T0 + late_ns, None)
     assert (later.valid, later.age_ns, later.up) == (valid, late_ns, first.up)
-
-
-def test_before_the_first_sample_nothing_is_known() -> None:
-    reading = AttitudeLaw(ROBOT_IMU).step(T0, None)
-    assert not reading.valid
-    assert reading.age_ns == -1
 
 
 def test_a_sensor_that_reports_invalid_is_believed_and_its_numbers_are_not() -> None:

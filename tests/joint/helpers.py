@@ -8,19 +8,30 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from services.joint.controller import CycleResult, JointController
+from services.joint.controller import ControllerState, CycleResult, JointController
 from services.joint.differential import joint_torque, motor_from_joint
 from services.joint.drive_manager import DriveAction, DriveCommand, DriveManager
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
+from services.joint.failsafe import timing_of
 from services.joint.neighbours import UNKNOWN, NeighbourView
 from services.joint.pd_law import Setpoint
 from services.joint.rearm_guard import LastState
-from shared.bus.messages import JointCommand, Mode, Pair
+from shared.bus.messages import DriveStatus, JointCommand, Mode, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.gain_schedule import believing
 from shared.config.robot_config import RobotConfig
+from tests.robots import ROBOT as SHIPPED
 
+_KNEE = msgspec.structs.replace(SHIPPED.stand.knee, k_p=(900.0, 1500.0), k_d=(45.0, 25.0))
+ROBOT = msgspec.structs.replace(
+    believing(SHIPPED),
+    stand=msgspec.structs.replace(SHIPPED.stand, knee=_KNEE),
+    joint_service=msgspec.structs.replace(SHIPPED.joint_service, hold_stiffens_theta=("ankle",)),
+)
+"""A robot with a soft knee, whose theta HOLD does not stiffen: no test here is about tuning. Its
+joint services believe any command within their limits; `envelope` is tested by itself."""
+TIMING = timing_of(ROBOT)
 T0 = 1_000 * NS_PER_S
 SESSION = 7
 LoopName = Literal["onboard", "service"]
@@ -69,7 +80,8 @@ def firmware(
 class BenchJoint:
     """A joint that stays where it is put, and the drive that measures it, in virtual time."""
 
-    controller: JointController
+    law: JointController
+    controller: ControllerState
 
     def __init__(self, robot: RobotConfig, status: DriveStatus) -> None:
         self.gear_ratio = robot.joint.gear_ratio
@@ -107,12 +119,13 @@ class Bench(BenchJoint):
 
     def __init__(self, robot: RobotConfig, module: str = "knee_right") -> None:
         super().__init__(robot, DriveStatus.ARMED)
-        self.controller = JointController(believing(robot), module)
+        self.law = JointController(believing(robot), module)
+        self.controller = self.law.start()
 
     @property
     def is_stiffened(self) -> bool:
         """Return True if the module says that it holds with all it has."""
-        return self.controller.state(self.now_ns).stiffened
+        return self.law.state(self.controller, self.now_ns).stiffened
 
     def fresh(self, **changes: Any) -> JointCommand:
         """Return the next command, echoing the state of the cycle before."""
@@ -131,7 +144,7 @@ class Bench(BenchJoint):
         """Run the next cycle: a period, or `after_ns`, after the one before."""
         self.now_ns += after_ns or self.cycle_ns
         reading = None if stalled else self.reading()
-        return self.controller.step(self.now_ns, reading, sent, estop, near=near)
+        return self.law.step(self.controller, self.now_ns, reading, sent, estop, near=near)
 
     def run(self, cycles: int, *, fresh: bool = False, **changes: Any) -> list[CycleResult]:
         """Run cycles, with a fresh command in each or with none."""
@@ -204,9 +217,14 @@ class ModuleBench(BenchJoint):
         self.torque: Pair = (0.0, 0.0)
 
     @property
-    def controller(self) -> JointController:
+    def law(self) -> JointController:  # type: ignore[override]
         """Return that of the module, which may be another one by now."""
         return self.module.controller
+
+    @property
+    def controller(self) -> ControllerState:  # type: ignore[override]
+        """Return the state of the module's controller."""
+        return self.module.state.controller
 
     def carried(self) -> Pair:
         """Return the joint torques that the drive gives now, N m, by the firmware's law."""
@@ -219,10 +237,7 @@ class ModuleBench(BenchJoint):
     def reading(self) -> DriveReading:
         """Return what the drive measures and tells."""
         return msgspec.structs.replace(
-            super().reading(),
-            error=int(self.error),
-            torque=self.carries,
-            encoder_zero=self.zero,
+            super().reading(), error=int(self.error), torque=self.carries, encoder_zero=self.zero
         )
 
     def cycle(

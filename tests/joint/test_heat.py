@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from services.joint.heat import HeatEstimate, HeatFile
+from services.joint.heat import HeatEstimate, HeatFile, HeatState
 from shared.bus.messages import LEFT_MAX_S, Pair
 from shared.clock import NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.run_directory import make_live_dir
+from tests.joint.helpers import ROBOT
 
 SQUAT: Pair = (20.2 * 0.0827, 14.9 * 0.0827)
 """Torques of a knee's motors, torso at 0.948 m; N m."""
@@ -20,152 +21,126 @@ LIGHT: Pair = (12.5 * 0.0827, 7.1 * 0.0827)
 """At 1.25 m."""
 
 
-def with_heat(robot: RobotConfig, **changes: object) -> RobotConfig:
-    """Return the robot with some keys of [heat] changed."""
-    return msgspec.structs.replace(robot, heat=msgspec.structs.replace(robot.heat, **changes))
-
-
 class Loaded:
     """An estimate under a load, by one cycle each 0.1 s."""
 
-    def __init__(self, robot: RobotConfig, **changes: object) -> None:
-        self.heat = HeatEstimate(with_heat(robot, **changes))
+    def __init__(self, **changes: object) -> None:
+        """Take the robot with some keys of [heat] changed."""
+        heat = msgspec.structs.replace(ROBOT.heat, **changes)
+        self.estimate = HeatEstimate(msgspec.structs.replace(ROBOT, heat=heat))
+        self.heat = self.estimate.cold()
         self.now_s = 1.0
 
     def run(
         self, torque: Pair, seconds: float, fet: Pair | None = None, motor: Pair | None = None
     ) -> None:
         for k in range(round(10.0 * seconds)):
-            once = k % 10 == 0
-            self.heat.advance(
-                round(self.now_s * NS_PER_S), torque, fet if once else None, motor if once else None
-            )
+            told = (fet, motor) if k % 10 == 0 else (None, None)
+            self.estimate.advance(self.heat, round(self.now_s * NS_PER_S), torque, *told)
             self.now_s += 0.1
 
 
 @pytest.mark.parametrize("before_s", [30.0, 300.0])
-def test_the_seconds_left_are_those_until_a_limit(robot: RobotConfig, before_s: float) -> None:
-    loaded = Loaded(robot)
+def test_the_seconds_left_are_those_until_a_limit(before_s: float) -> None:
+    loaded = Loaded()
     loaded.run(SQUAT, before_s)
-    left_s = loaded.heat.state.left_s
+    left_s = loaded.heat.left_s
     assert 60.0 < left_s < 900.0
     loaded.run(SQUAT, left_s * 0.9)
-    assert max(loaded.heat.state.winding) < robot.heat.winding_max
+    assert max(loaded.heat.winding) < ROBOT.heat.winding_max
     loaded.run(SQUAT, left_s * 0.2)
-    assert max(loaded.heat.state.winding) > robot.heat.winding_max
-    assert loaded.heat.state.left_s == 0.0
+    assert max(loaded.heat.winding) > ROBOT.heat.winding_max
+    assert loaded.heat.left_s == 0.0
 
 
-def test_a_light_load_can_last(robot: RobotConfig) -> None:
-    loaded = Loaded(robot)
-    loaded.run(LIGHT, 20.0)
-    assert loaded.heat.state.left_s == LEFT_MAX_S
-
-
-def test_a_load_taken_off_leaves_more_time_within_seconds(robot: RobotConfig) -> None:
-    loaded = Loaded(robot)
+def test_a_light_load_can_last_and_a_load_taken_off_leaves_more_time_within_seconds() -> None:
+    light, loaded = Loaded(), Loaded()
+    light.run(LIGHT, 20.0)
+    assert light.heat.left_s == LEFT_MAX_S
     loaded.run(SQUAT, 60.0)
-    loaded.heat.skip(400.0)
-    assert loaded.heat.state.left_s < 200.0
+    loaded.estimate.skip(loaded.heat, 400.0)
+    assert loaded.heat.left_s < 200.0
     loaded.run(LIGHT, 15.0)
-    assert loaded.heat.state.left_s > 600.0
+    assert loaded.heat.left_s > 600.0
 
 
-def test_no_seconds_left_are_negative_or_no_number_at_any_load_and_temperature(
-    robot: RobotConfig,
-) -> None:
-    heat = HeatEstimate(robot)
-    for winding in (-20.0, 40.0, 80.0, 94.99, 95.0, 250.0):
-        for housing in (-20.0, 40.0, 95.0, 140.0):
-            for amperes in (0.0, 1e-6, 5.0, 20.0, 40.0, 48.0, 400.0):
-                state = heat.state
-                state.winding = (winding, 40.0)
-                state.housing = (housing, 40.0)
-                state.load = ((amperes * 0.0827) ** 2, 0.0)
-                left_s = heat._left_s(0)
-                assert 0.0 <= left_s <= LEFT_MAX_S
-                assert (left_s == 0.0) == (winding >= robot.heat.winding_max)
+def test_no_seconds_left_are_negative_or_no_number_at_any_load_and_temperature() -> None:
+    heat = HeatEstimate(ROBOT)
+    windings, housings = (-20.0, 40.0, 80.0, 94.99, 95.0, 250.0), (-20.0, 40.0, 95.0, 140.0)
+    for winding, housing, amperes in product(windings, housings, (0.0, 1e-6, 5.0, 20.0, 48.0, 4e2)):
+        state = heat.cold()
+        state.winding, state.housing = (winding, 40.0), (housing, 40.0)
+        state.load = ((amperes * 0.0827) ** 2, 0.0)
+        left_s = min(heat._stage_left_s(state, 0), heat._winding_left_s(state, 0))
+        assert 0.0 <= left_s <= LEFT_MAX_S
+        assert (left_s == 0.0) == (winding >= ROBOT.heat.winding_max)
 
 
-def test_what_the_drive_reports_counts_more_than_the_estimate(robot: RobotConfig) -> None:
-    loaded = Loaded(robot, ambient=20.0)
+def test_what_the_drive_reports_counts_more_than_the_estimate() -> None:
+    loaded = Loaded(ambient=20.0)
     loaded.run(LIGHT, 60.0, fet=(85.0, 60.0), motor=(90.0, 88.0))
-    assert loaded.heat.state.winding == pytest.approx((90.0, 88.0), abs=4.0)
-    assert loaded.heat.state.stage[0] == pytest.approx(85.0, abs=1.0)
-    silent = Loaded(robot, ambient=20.0)
+    assert loaded.heat.winding == pytest.approx((90.0, 88.0), abs=4.0)
+    assert loaded.heat.stage[0] == pytest.approx(85.0, abs=1.0)
+    silent = Loaded(ambient=20.0)
     silent.run(LIGHT, 60.0)
-    assert max(silent.heat.state.winding) < 40.0
+    assert max(silent.heat.winding) < 40.0
 
 
-def test_a_thermistor_shows_how_warm_the_housing_is_and_with_it_how_much_time_is_left(
-    robot: RobotConfig,
-) -> None:
-    truth, told, deaf = (Loaded(robot, ambient=air) for air in (45.0, 25.0, 25.0))
-    for _ in range(240):
+def test_a_thermistor_shows_how_warm_the_housing_is_and_with_it_how_much_time_is_left() -> None:
+    """The air is taken 20 K too cool: of that, the thermistor knows nothing."""
+    truth, told, deaf = (Loaded(ambient=air) for air in (45.0, 25.0, 25.0))
+    for second in range(420):
         truth.run(SQUAT, 1.0)
-        told.run(SQUAT, 1.0, motor=truth.heat.state.winding)
-        deaf.run(SQUAT, 1.0)
-    left_s = truth.heat.state.left_s
-    assert told.heat.state.left_s == pytest.approx(left_s, rel=0.4), (
-        "the air is taken 20 K too cool"
-    )
-    assert deaf.heat.state.left_s > 2.0 * left_s
-    for _ in range(180):
-        truth.run(SQUAT, 1.0)
-        told.run(SQUAT, 1.0, motor=truth.heat.state.winding)
-    assert told.heat.state.left_s == pytest.approx(truth.heat.state.left_s, abs=20.0)
+        told.run(SQUAT, 1.0, motor=truth.heat.winding)
+        left_s = truth.heat.left_s
+        if second < 240:
+            deaf.run(SQUAT, 1.0)
+        if second == 239:
+            assert told.heat.left_s == pytest.approx(left_s, rel=0.4)
+            assert deaf.heat.left_s > 2.0 * left_s
+    assert told.heat.left_s == pytest.approx(left_s, abs=20.0)
 
 
-def test_a_process_that_stood_still_takes_its_last_load_for_a_while_only(
-    robot: RobotConfig,
-) -> None:
-    loaded = Loaded(robot)
+def test_a_process_that_stood_still_takes_its_last_load_for_a_while_only() -> None:
+    loaded, off = Loaded(), Loaded(estimate=False)
     loaded.run(SQUAT, 10.0)
-    before = loaded.heat.state.winding
+    before = loaded.heat.winding
     loaded.now_s += 3600.0
     loaded.run(SQUAT, 0.1)
-    assert math.dist(before, loaded.heat.state.winding) < 6.0
+    assert math.dist(before, loaded.heat.winding) < 6.0
+    assert (off.estimate.enabled, off.heat.left_s) == (False, -1.0), "by the robot file"
 
 
-def test_a_robot_file_without_heat_estimates_nothing(robot: RobotConfig) -> None:
-    heat = HeatEstimate(with_heat(robot, estimate=False))
-    assert not heat.enabled
-    assert heat.state.left_s == -1.0
-
-
-def restarted(robot: RobotConfig, run_dir: Path, now_s: float) -> HeatEstimate:
+def restarted(run_dir: Path, now_s: float) -> HeatState:
     """Return the estimate of a service that starts now."""
-    heat = HeatEstimate(robot)
-    HeatFile(run_dir, "knee_left").restore(heat, round(now_s * NS_PER_S))
+    estimate = HeatEstimate(ROBOT)
+    heat = estimate.cold()
+    HeatFile(run_dir, "knee_left").restore(estimate, heat, round(now_s * NS_PER_S))
     return heat
 
 
-def test_a_service_that_restarts_finds_the_module_as_warm_as_it_was_left(
-    robot: RobotConfig, tmp_path: Path
-) -> None:
-    loaded, file = Loaded(robot), HeatFile(tmp_path, "knee_left")
-    assert restarted(robot, tmp_path, 1.0).state.winding == (40.0, 40.0), "nothing is kept yet"
+def test_a_service_that_restarts_finds_the_module_as_warm_as_it_was_left(tmp_path: Path) -> None:
+    loaded, file = Loaded(), HeatFile(tmp_path, "knee_left")
+    assert restarted(tmp_path, 1.0).winding == (40.0, 40.0), "nothing is kept yet"
     loaded.run(SQUAT, 200.0)
     file.write(loaded.heat)
-    warm = max(loaded.heat.state.winding)
-    soon = restarted(robot, tmp_path, loaded.now_s + 5.0).state
+    warm = max(loaded.heat.winding)
+    soon = restarted(tmp_path, loaded.now_s + 5.0)
     assert max(soon.winding) >= warm, "its drive may have held on"
-    assert soon.load == loaded.heat.state.load
-    late = restarted(robot, tmp_path, loaded.now_s + 600.0).state
+    assert soon.load == loaded.heat.load
+    late = restarted(tmp_path, loaded.now_s + 600.0)
     assert 40.0 < max(late.winding) < warm - 10.0
-    next_day = restarted(robot, tmp_path, loaded.now_s + 86_400.0).state
+    next_day = restarted(tmp_path, loaded.now_s + 86_400.0)
     assert max(next_day.winding) == pytest.approx(40.0, abs=0.1)
-    rebooted = restarted(robot, tmp_path, 1.0).state
+    rebooted = restarted(tmp_path, 1.0)
     assert max(rebooted.winding) == pytest.approx(warm)
 
 
 @pytest.mark.parametrize(
     "content", [b"\xff" * 72, bytes(72), b"\x01" + bytes(63) + b"\xf0\x7f" * 4]
 )
-def test_a_file_that_holds_nonsense_holds_nothing(
-    robot: RobotConfig, tmp_path: Path, content: bytes
-) -> None:
+def test_a_file_that_holds_nonsense_holds_nothing(tmp_path: Path, content: bytes) -> None:
     (make_live_dir(tmp_path) / "knee_left.heat").write_bytes(content)
-    state = restarted(robot, tmp_path, 100.0).state
+    state = restarted(tmp_path, 100.0)
     assert max(state.winding) <= 40.0
     assert all(map(math.isfinite, (*state.winding, *state.housing, *state.load)))

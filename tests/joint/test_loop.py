@@ -11,11 +11,12 @@ import pytest
 
 from services.joint.differential import motor_from_joint
 from services.joint.drive_manager import ARM_EVERY_NS, IDLE_EVERY_NS, DriveManager
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.loop import JointLoop, JointPorts
 from services.joint.rearm_guard import LastState, RearmGuard
 from shared.bus.messages import (
     Cause,
+    DriveStatus,
     Estop,
     JointCommand,
     JointEvent,
@@ -23,12 +24,12 @@ from shared.bus.messages import (
     Mode,
     Pair,
     Refusal,
-)
+)  # fmt: skip
 from shared.bus.ports import M
 from shared.bus.traces import JointTrace
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tests.joint.helpers import SESSION, T0, command, with_service
+from tests.joint.helpers import ROBOT, SESSION, T0, command, with_service
 
 
 class Inbox(Generic[M]):
@@ -56,15 +57,16 @@ class FakeDrive:
         self.rig = rig
         self.status = DriveStatus.IDLE
         self.q: Pair = (0.0, -1.0)
-        self.silent = False
-        self.obeys = True
-        self.armed = self.idled = self.cleared = 0
+        self.silent, self.obeys = False, True
         self.comes_back = False
         """Errors are there again as soon as they are cleared."""
+        self.armed = self.idled = self.cleared = 0
         self.told: list[Pair] = []
         """Where the motors were told that they are."""
         self.torques: list[Pair] = []
         self.targets: list[MotorTarget] = []
+        self.set_position = self.told.append
+        self.write_torque, self.write = self.torques.append, self.targets.append
 
     def read(self, _timeout_s: float) -> DriveReading | None:
         if self.silent:
@@ -72,35 +74,23 @@ class FakeDrive:
         pos = motor_from_joint(self.q, self.rig.gear_ratio)
         return DriveReading(self.rig.now_ns, pos, (0.0, 0.0), self.status, 0)
 
-    def write_torque(self, torque: Pair) -> None:
-        self.torques.append(torque)
-
-    def write(self, target: MotorTarget) -> None:
-        self.targets.append(target)
-
     def arm(self, *, onboard: bool) -> None:
         assert onboard is self.rig.onboard
         self.armed += 1
-        if self.obeys:
-            self.status = DriveStatus.ARMED
+        self.status = DriveStatus.ARMED if self.obeys else self.status
 
     def clear_errors(self) -> None:
         self.cleared += 1
-        if not self.comes_back:
-            self.status = DriveStatus.IDLE
+        self.status = self.status if self.comes_back else DriveStatus.IDLE
 
     def idle(self) -> None:
         self.idled += 1
 
-    def set_position(self, turns: Pair) -> None:
-        self.told.append(turns)
-
-    def close(self) -> None:
-        pass
-
 
 class Rig:
     """A service's loop over one drive, and the file that outlives it, if there is one."""
+
+    ended_session = seq = 0
 
     def __init__(self, robot: RobotConfig, file: RearmGuard | None = None) -> None:
         self.now_ns = T0
@@ -110,21 +100,18 @@ class Rig:
         self.period_ns = round(1e9 / robot.joint_service.rate_hz)
         self.drive = FakeDrive(self)
         module = DriveManager(robot, "knee_right", file.read() if file else LastState.NOTHING)
-        self.controller = module.controller
+        self.law, self.controller = module.controller, module.state.controller
         self.commands, self.estops = Inbox[JointCommand](), Inbox[Estop]()
         self.states, self.events = Outbox[JointState](), Outbox[JointEvent]()
         self.traces = Outbox[JointTrace]()
         ports = JointPorts(
-            commands=self.commands,
-            estops=self.estops,
-            states=self.states,
-            events=self.events,
-            traces=self.traces,
-            planner=self,
+            self.commands, self.estops, self.states, self.events, self.traces, planner=self
         )
         self.loop = JointLoop(robot, module, self.drive, ports, file, clock=lambda: self.now_ns)
 
-    ended_session = 0
+    @property
+    def mode(self) -> Mode:
+        return self.controller.failsafe.mode
 
     def ended(self) -> int:
         """Return the session whose planner's process has ended, once."""
@@ -151,21 +138,10 @@ class Rig:
             self.commands.waiting.append(command(seq=self.seq, echo_t_ns=stamp))
             self.run(2)
 
-    seq = 0
-
-    @property
-    def mode(self) -> Mode:
-        return self.controller.failsafe.mode
-
 
 @pytest.fixture(params=["onboard", "service"])
-def rig(robot: RobotConfig, request: pytest.FixtureRequest) -> Rig:
-    return Rig(with_service(robot, loop=request.param))
-
-
-@pytest.fixture
-def onboard(robot: RobotConfig) -> Rig:
-    return Rig(with_service(robot, loop="onboard"))
+def rig(request: pytest.FixtureRequest) -> Rig:
+    return Rig(with_service(ROBOT, loop=request.param))
 
 
 class Stop:
@@ -180,81 +156,64 @@ class Stop:
         return self.left < 0
 
 
-def test_a_drive_without_errors_is_armed_at_once(rig: Rig) -> None:
-    rig.run(2)
-    assert (rig.drive.cleared, rig.drive.armed, rig.mode) == (0, 1, Mode.HOLD)
+@pytest.mark.parametrize(
+    "why", ["nothing", "lost", "outside its limits", "its errors come back", "no state is sent"]
+)
+def test_a_drive_is_armed_once_and_only_when_nothing_speaks_against_it(rig: Rig, why: str) -> None:
+    """A knee that has not been zeroed reads 0: its soft stop would kick it with 80 N m.
+
+    A failed encoder shows again 51 ms after it was cleared; armed meanwhile, it is blind.
+    """
+    drive, q, put = rig.drive, rig.drive.q, rig.states.put
+    drive.comes_back = why == "its errors come back"
+    if why == "lost":
+        drive.status = DriveStatus.LOST
+    elif drive.comes_back:
+        drive.status = DriveStatus.ERROR
+    elif why == "outside its limits":
+        drive.q = (0.0, 0.0)
+    elif why == "no state is sent":
+        rig.states.put = lambda _message: False  # type: ignore[method-assign]
+    if why != "nothing":
+        rig.run_ns(4 * ARM_EVERY_NS)
+        assert (drive.armed, drive.targets) == (0, [])
+        assert set(drive.torques) <= {(0.0, 0.0)}
+    assert (drive.cleared > 2) is drive.comes_back
+    drive.comes_back, drive.q, rig.states.put = False, q, put  # type: ignore[method-assign]
+    drive.status = DriveStatus.IDLE if drive.status is DriveStatus.LOST else drive.status
+    rig.run(2) if why == "nothing" else rig.run_ns(2 * ARM_EVERY_NS)
+    assert (drive.armed, rig.mode) == (1, Mode.HOLD)
 
 
-def test_errors_are_cleared_and_have_stayed_away_before_the_drive_is_armed(rig: Rig) -> None:
-    """A failed encoder shows again 51 ms after it was cleared; armed meanwhile, it is blind."""
-    rig.drive.status = DriveStatus.ERROR
-    rig.drive.comes_back = True
-    rig.run_ns(3 * ARM_EVERY_NS)
-    assert (rig.drive.cleared > 2, rig.drive.armed) == (True, 0)
-    rig.drive.comes_back = False
-    rig.run_ns(2 * ARM_EVERY_NS)
-    assert (rig.drive.armed, rig.mode) == (1, Mode.HOLD)
-
-
-def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held(
-    robot: RobotConfig,
-) -> None:
-    rig = Rig(with_service(robot, loop="service"))
+def test_a_torque_drive_armed_by_another_is_armed_by_us_before_it_is_held() -> None:
+    rig = Rig(with_service(ROBOT, loop="service"))
     rig.drive.status = DriveStatus.ARMED
     for mode in (Mode.DISARMED, Mode.HOLD):
         rig.run(1)
         assert (rig.mode, rig.drive.armed) == (mode, 1)
 
 
-def test_a_joint_outside_its_limits_is_not_armed_until_it_is_inside(rig: Rig) -> None:
-    """A knee that has not been zeroed reads 0: its soft stop would kick it with 80 N m."""
-    rig.drive.q = (0.0, 0.0)
-    rig.run(1000)
-    assert rig.drive.armed == 0
-    assert not rig.drive.targets
-    assert set(rig.drive.torques) <= {(0.0, 0.0)}
-    rig.drive.q = (0.0, -1.0)
-    rig.run_ns(ARM_EVERY_NS)
-    assert rig.mode is Mode.HOLD
-
-
-def test_a_lost_drive_is_not_asked_to_arm(rig: Rig) -> None:
-    rig.drive.status = DriveStatus.LOST
-    rig.run(100)
-    assert rig.drive.armed == 0
-
-
 @pytest.mark.parametrize("loop", ["onboard", "service"])
 @pytest.mark.parametrize("interrupted", [True, False])
 @pytest.mark.parametrize(
-    ("mode", "left"),
-    [
-        (Mode.DISARMED, LastState.NOTHING),
-        (Mode.HOLD, LastState.HELD),
-        (Mode.DAMP, LastState.DAMP),
-    ],
+    ("mode", "left"), [(Mode.DISARMED, "NOTHING"), (Mode.HOLD, "HELD"), (Mode.DAMP, "DAMP")]
 )
 def test_a_fleet_that_goes_down_leaves_idle_drives_and_a_service_ended_alone_one_that_holds(
-    robot: RobotConfig,
-    tmp_path: Path,
-    mode: Mode,
-    left: LastState,
-    interrupted: bool,
-    loop: str,
+    tmp_path: Path, mode: Mode, left: str, interrupted: bool, loop: str
 ) -> None:
     """A fleet that goes down leaves nothing, a service that ends alone that it held or sank."""
     guard = RearmGuard(tmp_path, "knee_right")
-    rig = Rig(with_service(robot, loop=loop), guard)
+    rig = Rig(with_service(ROBOT, loop=loop), guard)
     rig.drive.obeys = mode is not Mode.DISARMED
     rig.run(20)
     if mode is Mode.DAMP:
         rig.estops.waiting.append(Estop(t_ns=0, seq=1, source="test"))
         rig.run(5)
-    assert (rig.mode, guard.read()) == (mode, left)
+    assert (rig.mode, guard.read()) == (mode, LastState[left])
     rig.end(interrupted=interrupted)
     goes_on = loop == "onboard" and mode is not Mode.DISARMED and not interrupted
     assert rig.drive.idled == int(not goes_on)
-    assert guard.read() is (LastState.NOTHING if interrupted else left)
+    assert guard.read() is (LastState.NOTHING if interrupted else LastState[left])
 
 
 def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:
@@ -271,14 +230,13 @@ def test_states_carry_the_stamp_of_the_drives_sample(rig: Rig) -> None:
 
 def test_a_lost_position_idles_the_drive_and_then_makes_it_forget_its_zero(rig: Rig) -> None:
     rig.run(20)
-    q = rig.drive.q
     rig.drive.status = DriveStatus.UNZEROED
     rig.run(1)
     assert (rig.mode, rig.drive.idled, rig.drive.told) == (Mode.FAULT, 1, [])
     rig.run_ns(3 * IDLE_EVERY_NS)
     assert rig.drive.told == [(-rig.zero_mark_turns,) * 2]
     assert rig.drive.armed == 1, "never again by itself"
-    assert rig.states.sent[-1].q == pytest.approx(q)
+    assert rig.states.sent[-1].q == pytest.approx(rig.drive.q)
 
 
 def test_every_cycle_is_traced_and_the_rest_when_the_service_ends(rig: Rig) -> None:
@@ -305,39 +263,29 @@ def test_a_drive_that_starts_after_its_service_is_an_error_only_if_it_lasts(
     assert levels == [logging.INFO] + [logging.ERROR] * errors
 
 
-def test_what_is_no_command_is_counted_and_traced_with_its_cycle(onboard: Rig) -> None:
-    onboard.run(5)
-    onboard.commands.refused = 3
-    onboard.run(20)
-    state = onboard.states.sent[-1]
+def test_what_is_no_command_is_counted_and_traced_with_its_cycle(rig: Rig) -> None:
+    rig.run(5)
+    rig.commands.refused = 3
+    rig.run(20)
+    state = rig.states.sent[-1]
     assert (state.refused, state.refusal, state.refused_session) == (3, Refusal.MALFORMED, 0)
-    cycles = [cycle for trace in onboard.traces.sent for cycle in trace.cycles]
+    cycles = [cycle for trace in rig.traces.sent for cycle in trace.cycles]
     assert [cycle.malformed for cycle in cycles[:8]] == [0, 0, 0, 0, 0, 3, 0, 0]
 
 
-def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(onboard: Rig) -> None:
-    onboard.run(5)
-    onboard.lead(200)
-    onboard.ended_session = SESSION + 1
-    onboard.lead(20)
-    assert onboard.mode is Mode.TRACK, "somebody else's"
-    cycle = onboard.controller.cycle
-    onboard.ended_session = SESSION
-    onboard.run(1)
-    event = onboard.events.sent[-1]
-    assert (onboard.mode, event.cause) == (Mode.HOLD, Cause.PLANNER_ENDED)
-    assert event.age_ns < onboard.controller.timing.max_command_age_ns, "it was not the age rule"
-    onboard.run(20)
-    cycles = [each for trace in onboard.traces.sent for each in trace.cycles]
+def test_the_end_of_the_planners_process_is_hold_in_that_cycle_and_traced(rig: Rig) -> None:
+    rig.run(5)
+    rig.lead(200)
+    rig.ended_session = SESSION + 1
+    rig.lead(20)
+    assert rig.mode is Mode.TRACK, "somebody else's"
+    cycle = rig.controller.cycle
+    rig.ended_session = SESSION
+    rig.run(1)
+    event = rig.events.sent[-1]
+    assert (rig.mode, event.cause) == (Mode.HOLD, Cause.PLANNER_ENDED)
+    assert event.age_ns < rig.law.timing.max_command_age_ns, "it was not the age rule"
+    rig.run(20)
+    cycles = [each for trace in rig.traces.sent for each in trace.cycles]
     ended = {at: each.ended for at, each in enumerate(cycles, 1) if each.ended}
     assert ended == {cycle - 39: SESSION + 1, cycle + 1: SESSION}
-
-
-def test_a_module_whose_state_cannot_be_sent_does_not_arm(robot: RobotConfig) -> None:
-    rig = Rig(robot)
-    put, rig.states.put = rig.states.put, lambda _message: False  # type: ignore[method-assign]
-    rig.run_ns(NS_PER_S)
-    assert rig.drive.armed == 0
-    rig.states.put = put  # type: ignore[method-assign]
-    rig.run_ns(NS_PER_S)
-    assert rig.drive.armed > 0

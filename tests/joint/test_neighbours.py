@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from itertools import product
+from itertools import permutations, product
 from pathlib import Path
 
 import pytest
@@ -64,62 +64,52 @@ def test_a_row_that_is_old_being_written_or_never_was_is_not_known(
 def test_which_module_holds_beside_which() -> None:
     """Each module against each other's mode, age and whether it is caught."""
     ages = (-STALE_NS, -1, 0, GONE_NS, GONE_NS + 1)
-    for asks, other, mode, age_ns, caught in product(MODULES, MODULES, Mode, ages, (0, 1)):
-        if asks == other:
-            continue
-        found = view_of(
-            asks, rows(**{other: NeighbourRow(T0 - age_ns, 0.0, 0.0, mode, caught)}), T0
-        )
+    for (asks, other), mode, age_ns, caught in product(
+        permutations(MODULES, 2), Mode, ages, (0, 1)
+    ):
+        row = NeighbourRow(T0 - age_ns, 0.0, 0.0, mode, caught)
+        found = view_of(asks, rows(**{other: row}), T0)
         pair = kind_of(asks), kind_of(other)
         stays = age_ns > GONE_NS or mode != Mode.DAMP or caught == 1
         assert found.sinks is not (pair[0] == "knee" and stays), (asks, other, mode, age_ns)
-        for_knee, for_ankle = pair[1] == "knee", pair == ("knee", "ankle")
-        stiffens = mode is Mode.FAULT and (for_knee or for_ankle)
-        assert found.stiffen is stiffens, (asks, other, mode, age_ns)
+        braces = pair[1] == "knee" or pair == ("knee", "ankle")
+        assert found.stiffen is (mode is Mode.FAULT and braces), (asks, other, mode, age_ns)
 
 
 @pytest.mark.parametrize(
     "others",
     [
-        {"knee_left": CAUGHT},
-        {"hip_right": None},
-        {"hip_right": NEVER},
-        {"knee_right": NEVER},
-        {"knee_right": AHEAD},
-        {"hip_left": DEAD, "knee_right": NEVER},
+        {"knee_left": CAUGHT}, {"hip_right": None}, {"hip_right": NEVER}, {"knee_right": NEVER},
+        {"knee_right": AHEAD}, {"hip_left": DEAD, "knee_right": NEVER},
         {"hip_left": DEAD, "knee_right": AHEAD},
     ],
-)
+)  # fmt: skip
 def test_a_knee_waits_neither_for_itself_nor_for_what_is_not_known(
     others: dict[str, NeighbourRow | None],
 ) -> None:
-    """Its like on another host makes it blind to that leg: to stop alone would tip the robot."""
+    """Its like on another host makes it blind to that leg: to stop alone would tip the robot.
+
+    It stiffens for its own ankle whatever is known of the other leg.
+    """
     assert view_of("knee_left", rows(**others), T0).sinks
-
-
-def test_a_knee_stiffens_for_its_own_ankle_whatever_is_known_of_the_other_leg() -> None:
-    for elsewhere in (NEVER, AHEAD):
-        assert view_of("knee_left", rows(ankle_left=LIMP, knee_right=elsewhere), T0).stiffen
-
-
-def test_a_drive_that_never_sent_a_state_is_not_limp() -> None:
-    for asks, other in (("hip_right", "knee_left"), ("knee_right", "ankle_left")):
-        for t_ns in (0, 1):
-            limp = rows(**{other: NeighbourRow(t_ns, 0.0, 0.0, Mode.FAULT)})
-            assert view_of(asks, limp, T0).stiffen is (t_ns > 0)
+    assert view_of("knee_left", rows(**(others | {"ankle_left": LIMP})), T0).stiffen
 
 
 @pytest.mark.parametrize("own_age_ns", [0, STALE_NS, STALE_NS + 1])
 def test_a_drive_that_is_silent_beside_one_that_is_heard_may_be_limp(own_age_ns: int) -> None:
-    """A machine that stood still silences them all, and is no reason to stiffen."""
-    for asks, other in product(MODULES, MODULES):
-        silent = {asks: NeighbourRow(T0 - own_age_ns, 0.0, 0.0, Mode.HOLD)}
-        silent[other] = NeighbourRow(T0 - own_age_ns, 0.0, 0.0, Mode.HOLD, silent=1)
-        found = view_of(asks, rows(**silent), T0)
-        if asks != other:
-            limp = rows(**{other: LIMP})
-            wanted = own_age_ns <= STALE_NS and view_of(asks, limp, T0).stiffen
-            assert found.stiffen is wanted, (asks, other)
+    """A machine that stood still silences them all, and is no reason to stiffen.
+
+    Nor is a drive that never sent a state.
+    """
+    for asks, other in permutations(MODULES, 2):
+        own = NeighbourRow(T0 - own_age_ns, 0.0, 0.0, Mode.HOLD)
+        silent = {asks: own, other: own._replace(silent=1)}
+        limp = view_of(asks, rows(**{other: LIMP}), T0).stiffen
+        wanted = own_age_ns <= STALE_NS and limp
+        assert view_of(asks, rows(**silent), T0).stiffen is wanted, (asks, other)
+        for t_ns in (0, 1):
+            first = view_of(asks, rows(**{other: LIMP._replace(t_ns=t_ns)}), T0)
+            assert first.stiffen is (limp and t_ns > 0)
 
 
 def test_a_row_half_written_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,16 +142,18 @@ def six(tmp_path: Path) -> dict[str, Neighbours]:
 
 def test_what_one_writes_the_others_read(tmp_path: Path, six: dict[str, Neighbours]) -> None:
     assert Neighbours.mode_of(tmp_path, "hip_left") is None
+    modes = dict(zip(MODULES, (*Mode, Mode.HOLD), strict=True))
+    for name, mode in modes.items():
+        six[name].write(NeighbourRow(T0, 0.0, 0.0, mode))
+    assert {name: Neighbours.mode_of(tmp_path, name) for name in MODULES} == modes
     for cycle in range(300):  # the number's low byte goes round
         for i, name in enumerate(MODULES):
             six[name].write(NeighbourRow(T0 + cycle, 0.1 * i + cycle, 0.01 * i, Mode.DAMP))
-        assert six["hip_left"].view(T0 + cycle) == NeighbourView(
-            pytest.approx((0.7 + 2 * cycle, 0.07))
-        )
+        leg = pytest.approx((0.7 + 2 * cycle, 0.07))
+        assert six["hip_left"].view(T0 + cycle) == NeighbourView(leg)
     assert six["ankle_left"].view(T0) == NeighbourView(pytest.approx((0.4 + 299, 0.04)))
     assert six["knee_left"].view(T0 + 299).sinks
     assert not six["knee_left"].view(T0 + 300 + GONE_NS).sinks, "the others are dead"
-    assert Neighbours.mode_of(tmp_path, "hip_left") is Mode.DAMP
 
 
 def test_a_row_left_half_written_is_not_read(tmp_path: Path, six: dict[str, Neighbours]) -> None:
@@ -177,13 +169,6 @@ def test_a_row_left_half_written_is_not_read(tmp_path: Path, six: dict[str, Neig
     successor = Neighbours(tmp_path, "knee_left")
     successor.write(NeighbourRow(T0, 0.3, 0.0, Mode.DAMP))
     assert six["hip_left"].view(T0) == NeighbourView(pytest.approx((0.4, 0.0)))
-
-
-def test_each_service_finds_its_own_row(tmp_path: Path, six: dict[str, Neighbours]) -> None:
-    for name, mode in zip(MODULES, (*Mode, Mode.HOLD), strict=True):
-        six[name].write(NeighbourRow(T0, 0.0, 0.0, mode))
-    for name, mode in zip(MODULES, (*Mode, Mode.HOLD), strict=True):
-        assert Neighbours.mode_of(tmp_path, name) is mode
 
 
 def test_a_row_mixed_of_two_is_never_read(tmp_path: Path, six: dict[str, Neighbours]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import msgspec
 import numpy as np
 import pytest
@@ -15,7 +17,6 @@ from tests.joint.helpers import FULL
 
 shares = st.floats(0.0, 1.0)
 
-
 gains = st.just(0.0) | st.floats(1e-3, 6000.0)
 
 
@@ -25,15 +26,11 @@ def pairs(elements: st.SearchStrategy[float]) -> st.SearchStrategy[Pair]:
 
 angles = pairs(st.floats(-6.0, 6.0))
 
-
 rates = pairs(st.floats(-20.0, 20.0))
-
 
 torques = pairs(st.floats(-200.0, 200.0))
 
-
 setpoints = st.builds(Setpoint, angles, rates, torques, torques, pairs(gains), pairs(gains))
-
 
 SOFT = Setpoint((0.1, -1.0), (0.2, -0.4), (3.0, -20.0), (5.0, -6.0), (100.0, 0.0), (10.0, 0.0))
 SLACK = msgspec.structs.replace(SOFT, k_p=(0.5, 0.4), k_d=(0.3, 0.2))
@@ -54,18 +51,15 @@ def test_torque_is_pd_plus_feedforward_plus_coupled(s: Setpoint, q: Pair, v: Pai
 def test_blend_of_two_laws_gives_the_blended_torque_everywhere_and_no_negative_gain(
     a: Setpoint, b: Setpoint, share: float, q: Pair, v: Pair
 ) -> None:
+    """With no gain at all it goes to the later reference."""
     blended = pd_law.blend(a, b, share)
     apart = np.array([pd_law.torque(a, q, v), pd_law.torque(b, q, v)])
     together = [1.0 - share, share] @ apart
     np.testing.assert_allclose(pd_law.torque(blended, q, v), together, rtol=1e-9, atol=1e-6)
     assert min(*blended.k_p, *blended.k_d) >= 0.0
-
-
-def test_with_no_gain_at_all_a_blend_goes_to_the_later_reference() -> None:
-    limp = msgspec.structs.replace(FULL, k_p=(0.0, 0.0), k_d=(0.0, 0.0))
-    later = msgspec.structs.replace(limp, q_ref=(0.3, 0.5), v_ref=(0.7, 0.9))
+    limp, later = (msgspec.structs.replace(x, k_p=(0.0, 0.0), k_d=(0.0, 0.0)) for x in (a, b))
     blended = pd_law.blend(limp, later, 0.5)
-    assert (blended.q_ref, blended.v_ref) == ((0.3, 0.5), (0.7, 0.9))
+    assert (blended.q_ref, blended.v_ref) == (later.q_ref, later.v_ref)
 
 
 @given(s=setpoints, k_p=pairs(gains), k_d=pairs(gains), share=shares)
@@ -92,19 +86,16 @@ def test_held_keeps_all_but_rates_and_coupled_torque_which_fade(s: Setpoint, sha
 
 
 @given(s=setpoints, share=shares, q=angles, v=rates)
-def test_damped_only_feedforward_is_left(s: Setpoint, share: float, q: Pair, v: Pair) -> None:
+def test_damped_only_feedforward_is_left_and_axes_that_do_not_sink_hold_on(
+    s: Setpoint, share: float, q: Pair, v: Pair
+) -> None:
     expected = share * np.array(s.tau_ff) - 60.0 * np.array(v)
-    damped = pd_law.damp(pd_law.freeze(s, 0.0), (True, True), 60.0, share, 1.0)
-    np.testing.assert_allclose(pd_law.torque(damped, q, v), expected, rtol=1e-12, atol=1e-9)
-
-
-@given(s=setpoints, share=shares, q=angles, v=rates)
-def test_axes_that_do_not_sink_hold_on(s: Setpoint, share: float, q: Pair, v: Pair) -> None:
     frozen = pd_law.freeze(s, 0.0)
-    tau = pd_law.torque(pd_law.damp(frozen, (False, True), 60.0, share, 1.0), q, v)
-    assert tau[0] == pd_law.torque(frozen, q, v)[0]
-    swapped = pd_law.torque(pd_law.damp(frozen, (True, False), 60.0, share, 1.0), q, v)
-    assert swapped[1] == pd_law.torque(frozen, q, v)[1]
+    damped = pd_law.damp(frozen, (True, True), 60.0, share, 1.0)
+    np.testing.assert_allclose(pd_law.torque(damped, q, v), expected, rtol=1e-12, atol=1e-9)
+    for sinks, axis in (((False, True), 0), ((True, False), 1)):
+        damped = pd_law.damp(frozen, sinks, 60.0, share, 1.0)
+        assert pd_law.torque(damped, q, v)[axis] == pd_law.torque(frozen, q, v)[axis]
 
 
 @given(s=setpoints, q=angles, v=rates, k_d=gains)
@@ -136,15 +127,12 @@ def test_too_far_for_a_stiffer_spring_it_holds_here(away_phi: float, away_theta:
     )
 
 
-@pytest.mark.parametrize("sinks", [(False, False), (True, False), (False, True), (True, True)])
-def test_each_axis_that_is_to_sink_carries_its_own_load_on(sinks: tuple[bool, bool]) -> None:
-    q = (0.3, -1.5)
-    tau_ff = (3.0 - 20.0 if sinks[0] else 3.0, -20.0 + 400.0 if sinks[1] else -20.0)
-    carried = pd_law.load_to_feedforward(FULL, sinks, q)
-    assert carried == msgspec.structs.replace(FULL, tau_ff=pytest.approx(tau_ff))
-
-
-def test_a_theta_that_is_levelled_or_caught_leaves_phi_as_it_was() -> None:
+def test_each_axis_that_is_to_sink_carries_its_own_load_on() -> None:
+    """And a theta that is levelled or caught leaves phi as it was."""
+    for sinks in product((False, True), repeat=2):
+        tau_ff = (3.0 - 20.0 * sinks[0], -20.0 + 400.0 * sinks[1])
+        carried = pd_law.load_to_feedforward(FULL, sinks, (0.3, -1.5))
+        assert carried == msgspec.structs.replace(FULL, tau_ff=pytest.approx(tau_ff))
     assert pd_law.hold_theta(FULL, -0.7, 0.3, 900.0, 60.0) == Setpoint(
         (0.1, -0.7), (0.2, 0.3), FULL.tau_ff, FULL.tau_coupled, (100.0, 900.0), (10.0, 60.0)
     )

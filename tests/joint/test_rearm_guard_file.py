@@ -34,21 +34,19 @@ from tools.verbs import services
 
 MODULE = "knee_left"
 
-
 PID = 4711
-
-
-@pytest.fixture
-def left(tmp_path: Path) -> RearmGuard:
-    """Return what a service of MODULE left that held, mapped as by one that runs."""
-    file = RearmGuard(tmp_path, MODULE)
-    file.write(LastState.HELD)
-    return file
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> RearmGuard:
     return RearmGuard(tmp_path, MODULE)
+
+
+@pytest.fixture
+def left(file: RearmGuard) -> RearmGuard:
+    """Return what a service of MODULE left that held, mapped as by one that runs."""
+    file.write(LastState.HELD)
+    return file
 
 
 @pytest.mark.parametrize("last_state", list(LastState))
@@ -80,13 +78,6 @@ def test_what_is_forgotten_is_so_for_a_process_that_has_it_mapped(
     other = LastState.HELD if last_state is LastState.DAMP else LastState.DAMP
     file.write(other)
     assert RearmGuard(tmp_path, MODULE).read() is other, "still the same file"
-
-
-def test_where_no_service_is_nothing_is_forgotten_or_stopped(tmp_path: Path) -> None:
-    clear(tmp_path, MODULE)
-    assert not request_stop(tmp_path, MODULE)
-    assert stop_source(tmp_path, MODULE) == ""
-    assert not path_of(tmp_path, MODULE).exists()
 
 
 class Fleet:
@@ -123,6 +114,7 @@ def fleet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
 
 
 def test_a_stop_is_seen_at_once_until_it_is_forgotten(tmp_path: Path, file: RearmGuard) -> None:
+    """Where no service is nothing is forgotten or stopped."""
     assert not file.stop_requested
     assert request_stop(tmp_path, MODULE)
     assert file.stop_requested
@@ -131,6 +123,10 @@ def test_a_stop_is_seen_at_once_until_it_is_forgotten(tmp_path: Path, file: Rear
     assert file.stop_requested, "what the service leaves does not undo it"
     clear(tmp_path, MODULE)
     assert not file.stop_requested
+    clear(tmp_path, "hip_left")
+    assert not request_stop(tmp_path, "hip_left")
+    assert stop_source(tmp_path, "hip_left") == ""
+    assert not path_of(tmp_path, "hip_left").exists()
 
 
 def test_a_pendant_reaches_the_services_that_run(tmp_path: Path, file: RearmGuard) -> None:
@@ -142,14 +138,11 @@ def test_a_pendant_reaches_the_services_that_run(tmp_path: Path, file: RearmGuar
         pendant.beat()
         assert (file.beats, other.beats) == (beats, beats)
     assert (file.read(), file.stop_requested) == (LastState.NOTHING, False)
+    clear(tmp_path, MODULE)
+    assert (file.beats, other.beats) == (0, 299), "one from before is forgotten with the rest"
+    pendant.beat()
     pendant.lay_down()
     assert (file.beats, other.beats) == (0, 0)
-
-
-def test_a_pendant_from_before_is_forgotten_with_the_rest(tmp_path: Path, file: RearmGuard) -> None:
-    Pendant(tmp_path, MODULES).beat()
-    clear(tmp_path, MODULE)
-    assert file.beats == 0
 
 
 def test_a_pendant_reaches_a_service_through_a_file_older_than_pendants(tmp_path: Path) -> None:
@@ -160,44 +153,26 @@ def test_a_pendant_reaches_a_service_through_a_file_older_than_pendants(tmp_path
     assert (found.read(), found.stop_requested, found.beats) == (LastState.HELD, False, 1)
 
 
-def test_the_file_does_not_grow_and_a_stop_is_one_byte_of_it(tmp_path: Path) -> None:
-    for _ in range(3):
-        RearmGuard(tmp_path, MODULE)
-        request_stop(tmp_path, MODULE)
-    assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14 + SOURCE_MAX)
-
-
-def test_a_service_that_is_down_starts_with_no_past(fleet: Fleet, left: RearmGuard) -> None:
-    fleet.start.start_service(MODULE)
-    assert ("supervisor.startProcess", MODULE, False) in fleet.made
-    assert left.read() is LastState.NOTHING
-
-
-@pytest.mark.parametrize("suspended", [True, False])
-def test_starting_what_runs_asks_for_none(fleet: Fleet, left: RearmGuard, suspended: bool) -> None:
+@pytest.mark.parametrize("state", ["down", "runs", "suspended"])
+def test_a_service_that_is_down_starts_with_no_past_and_starting_what_runs_asks_for_none(
+    fleet: Fleet, left: RearmGuard, state: str
+) -> None:
     """It knows itself what it has held; should it crash after, the next has to know as well."""
-    fleet.pids, fleet.suspended = {MODULE: PID}, suspended
-    runs = fleet.start.start_service(MODULE)
-    assert runs == (None if suspended else PID), "it runs already"
-    assert [made[0] for made in fleet.made] == ["kill"] * suspended
-    assert left.read() is LastState.HELD
+    fleet.pids, fleet.suspended = {MODULE: PID} if state != "down" else {}, state == "suspended"
+    assert (fleet.start.start_service(MODULE) == PID) is (state == "runs"), "it runs already"
+    started = ("supervisor.startProcess", MODULE, False) in fleet.made
+    assert started is (state == "down")
+    assert state == "down" or [made[0] for made in fleet.made] == ["kill"] * fleet.suspended
+    assert left.read() is (LastState.NOTHING if state == "down" else LastState.HELD)
 
 
-@pytest.mark.parametrize(
-    ("name", "after"),
-    [
-        ("KILL", LastState.NOTHING),
-        ("TERM", LastState.NOTHING),
-        ("STOP", LastState.HELD),
-        ("CONT", LastState.HELD),
-    ],
-)
+@pytest.mark.parametrize("name", ["KILL", "TERM", "STOP", "CONT"])
 def test_the_verb_that_ends_a_service_asks_for_the_next_and_one_that_suspends_it_does_not(
-    fleet: Fleet, left: RearmGuard, name: str, after: LastState
+    fleet: Fleet, left: RearmGuard, name: str
 ) -> None:
     fleet.kill(MODULE, name)
     assert fleet.made == [("kill", PID, signal.Signals[f"SIG{name}"])]
-    assert left.read() is after
+    assert left.read() is (LastState.NOTHING if name in ("KILL", "TERM") else LastState.HELD)
 
 
 def test_a_service_without_a_drive_leaves_nothing_to_forget(fleet: Fleet, tmp_path: Path) -> None:
@@ -238,8 +213,14 @@ def test_a_fleet_knows_no_state_before_it(tmp_path: Path, left: RearmGuard, ends
 
 
 def test_the_memory_of_a_service_takes_its_space_when_it_is_made(tmp_path: Path) -> None:
-    """A store to memory that a full disk cannot back ends the process with SIGBUS."""
-    RearmGuard(tmp_path, MODULE)
+    """A store to memory that a full disk cannot back ends the process with SIGBUS.
+
+    The file does not grow, and a stop is one byte of it.
+    """
+    for _ in range(3):
+        RearmGuard(tmp_path, MODULE)
+        request_stop(tmp_path, MODULE)
+    assert path_of(tmp_path, MODULE).read_bytes() == b"\x00\x01" + bytes(14 + SOURCE_MAX)
     neighbours.Neighbours(tmp_path, MODULE)
     for path in (path_of(tmp_path, MODULE), neighbours.path_of(tmp_path)):
         found = path.stat()

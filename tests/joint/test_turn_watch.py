@@ -8,9 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.differential import joint_from_motor
+from services.joint.drivers.base import DriveReading
 from services.joint.failsafe import Event
-from services.joint.joint_estimate import REJECTED_MAX, JointEstimate
+from services.joint.joint_estimate import (
+    JUMP_SPEED,
+    JUMP_TURNS,
+    REJECTED_MAX,
+    SPEED_MAX,
+    JointEstimate,
+)
 from services.joint.turn_watch import (
     ACCELERATION,
     AT_ZERO,
@@ -21,12 +28,13 @@ from services.joint.turn_watch import (
     STILL_NS,
     TurnWatch,
 )
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
 
 T_NS = NS_PER_S
 PERIOD_NS = 2 * NS_PER_MS
+N = 17.5
 BANDWIDTH = 2000.0
 
 
@@ -34,7 +42,7 @@ class Axis:
     """A motor, its absolute encoder, and a drive that counts the short way round."""
 
     def __init__(self, pos: float, speed: float) -> None:
-        self.samples = JointEstimate(17.5)
+        self.samples = JointEstimate(N)
         self.true = self.count = self.estimate = pos
         self.speed = speed
         self.t_ns = NS_PER_S
@@ -140,35 +148,30 @@ def test_samples_that_do_not_come_after_a_short_rest_raise_no_doubt(silent_ms: i
     assert not axis.samples.turns_lost
 
 
-@pytest.mark.parametrize("in_turn", [0.02, 0.3, 0.499, 0.501, 0.95])
+@pytest.mark.parametrize("in_turn", [0.02, 0.1, 0.3, 0.499, 0.501, 0.95])
 @pytest.mark.parametrize("armed", [True, False])
 def test_an_encoder_that_reads_0_is_noticed_from_any_angle(in_turn: float, armed: bool) -> None:
-    axis = Axis(2.0 + in_turn, 0.0)
-    axis.goes(0.0, 5)
-    axis.sample(DriveStatus.IDLE, armed=False, zero=(0.0, 0.5))
-    for _ in range(2 * GAP_NS // PERIOD_NS):
-        axis.move(0.0, 0.0, armed=armed)
-    assert axis.samples.turns_lost
+    """And one that rests elsewhere than at its 0 does not read 0."""
+    for reads_zero in (True, False):
+        axis = Axis(2.0 + in_turn, 0.0)
+        axis.goes(0.0, 5)
+        axis.sample(DriveStatus.IDLE, armed=False, zero=(0.0, 0.5))
+        for _ in range(500):
+            axis.move(0.0, 0.0 if reads_zero else axis.word(), armed=armed)
+        assert axis.samples.turns_lost is reads_zero
 
 
-def test_an_encoder_that_rests_elsewhere_than_at_its_0_does_not_read_0() -> None:
-    axis = Axis(2.1, 0.0)
-    axis.sample(DriveStatus.IDLE, armed=False, zero=(0.0, 0.5))
-    axis.goes(0.0, 500)
-    assert not axis.samples.turns_lost
-
-
-@pytest.mark.parametrize("turns", [0.0, 3.0, -2.0])
-def test_a_position_is_at_the_encoders_0_within_three_counts_on_either_side(turns: float) -> None:
+def test_a_position_is_at_the_encoders_0_within_three_counts_on_either_side() -> None:
     watch = TurnWatch(encoder_zero=0.3)
-    for off, at_zero in ((-2.0, False), (-0.5, True), (0.5, True), (2.0, False), (2500.0, False)):
-        assert watch.is_zero(turns + 0.3 + off * AT_ZERO) is at_zero
+    for turns in (0.0, 3.0, -2.0):
+        for off in (-2.0, -0.5, 0.5, 2.0, 2500.0):
+            assert watch.is_zero(turns + 0.3 + off * AT_ZERO) is (abs(off) < 1.0)
     assert not TurnWatch().is_zero(-1.0), "it is not known where"
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_an_idle_axis_that_jumps_has_moved_until_its_encoders_0_is_told(axis: int) -> None:
-    samples, at = JointEstimate(17.5), [0.0, 0.0]
+    samples, at = JointEstimate(N), [0.0, 0.0]
 
     def take(t_ns: int, zero: Pair | None = None) -> bool:
         pos = (at[0], at[1])
@@ -201,8 +204,7 @@ def test_a_failed_encoder_lacks_turns_until_the_drive_has_no_zero(armed: bool) -
 def rested(slowest: float, fastest: float, rested_ns: int) -> TurnWatch:
     """Return a watch of an axis that has rested at 0, its newest sample a period before T_NS."""
     newest_ns = T_NS - PERIOD_NS
-    since_ns = newest_ns - rested_ns
-    return TurnWatch(0.0, since_ns, slowest, fastest, newest_ns)
+    return TurnWatch(0.0, newest_ns - rested_ns, slowest, fastest, newest_ns)
 
 
 def goes_on(watch: TurnWatch, jump: float) -> bool:
@@ -243,22 +245,15 @@ def test_a_jump_after_a_rest_is_possible_as_far_as_the_motor_can_have_gone(
                 assert watch.lost is any(ends[0] <= other <= ends[1] for other in others)
 
 
-@pytest.mark.parametrize(
-    ("rested_ns", "explained"),
-    [(STILL_NS - 1, False), (STILL_NS, True), (GAP_NS, True), (GAP_NS + 1, False)],
-)
-def test_a_rest_is_a_gap_from_two_periods_on_up_to_what_the_drive_reports_itself(
-    rested_ns: int, explained: bool
-) -> None:
-    assert goes_on(rested(-9.0, 9.0, rested_ns), 0.05) is explained
+def test_a_rest_is_a_gap_from_two_periods_on_up_to_what_the_drive_reports_itself() -> None:
+    rests = {STILL_NS - 1: False, STILL_NS: True, GAP_NS: True, GAP_NS + 1: False}
+    for rested_ns, explained in rests.items():
+        assert goes_on(rested(-9.0, 9.0, rested_ns), 0.05) is explained
 
 
-@pytest.mark.parametrize(("jump", "possible"), [(0.25, True), (-0.25, True), (0.26, False)])
-def test_an_axis_that_is_seen_goes_as_far_as_it_is_free_to(jump: float, possible: bool) -> None:
-    assert TurnWatch().take(T_NS, jump, 0.0, jump, 0.25) is possible
-
-
-def test_an_estimate_that_moves_by_a_third_of_a_count_rests() -> None:
+def test_an_axis_that_is_seen_goes_as_far_as_it_is_free_to_and_rests_within_a_third_count() -> None:
+    for jump, possible in ((0.25, True), (-0.25, True), (0.26, False)):
+        assert TurnWatch().take(T_NS, jump, 0.0, jump, 0.25) is possible
     watch = TurnWatch(0.0, 5)
     watch.take(T_NS, STILL, 0.0, STILL, 1.0)
     assert (watch.pos, watch.changed_ns) == (0.0, 5)
@@ -271,3 +266,116 @@ def test_the_bounds_of_the_speed_follow_it_no_faster_than_a_motor_can() -> None:
     assert (watch.slowest, watch.fastest) == pytest.approx((9.2, 9.6))
     watch.take(T_NS + 2 * GAP_NS, 0.02, 0.0, 0.0, 1.0)
     assert (watch.slowest, watch.fastest) == (0.0, 0.0)
+
+
+# ---- which samples of a drive are believed
+
+
+def reading(
+    t_ns: int,
+    pos: Pair = (1.0, -2.0),
+    vel: Pair = (0.0, 0.0),
+    status: DriveStatus = DriveStatus.ARMED,
+) -> DriveReading:
+    return DriveReading(t_ns, pos, vel, status, 0)
+
+
+@pytest.fixture
+def samples() -> JointEstimate:
+    samples = JointEstimate(N)
+    samples.take(reading(T_NS), armed=True)
+    return samples
+
+
+@pytest.mark.parametrize("motor", [0, 1])
+@pytest.mark.parametrize(("beyond", "accepted"), [(-1e-6, True), (1e-6, False)])
+def test_a_motor_moves_no_further_than_its_speed_and_a_margin_explain(
+    samples: JointEstimate, motor: int, beyond: float, accepted: bool
+) -> None:
+    before = list(samples.pos)
+    moved = list(before)
+    moved[motor] += JUMP_TURNS + JUMP_SPEED * 2e-3 + beyond
+    event = samples.take(reading(T_NS + PERIOD_NS, (moved[0], moved[1])), armed=True)
+    assert event is (Event.DRIVE_ARMED if accepted else Event.NONE)
+    assert list(samples.pos) == (moved if accepted else before)
+    assert samples.q == joint_from_motor(samples.pos, N)
+
+
+@pytest.mark.parametrize(
+    ("vel", "moved"),
+    [((60.0, 0.0), (1.12, -2.0)), ((0.0, 60.0), (1.0, -1.88)), ((0.0, -60.0), (1.0, -2.12))],
+)
+def test_a_fast_motor_may_go_on_fast(samples: JointEstimate, vel: Pair, moved: Pair) -> None:
+    samples.take(reading(T_NS + PERIOD_NS, vel=vel), armed=True)
+    assert samples.take(reading(T_NS + 2 * PERIOD_NS, moved), armed=True) is Event.DRIVE_ARMED
+    assert samples.pos == moved
+
+
+@pytest.mark.parametrize("speed", [1.001 * SPEED_MAX, -1e30, float("nan")])
+def test_a_speed_beyond_any_motors_excuses_no_jump(samples: JointEstimate, speed: float) -> None:
+    before = samples.pos
+    for axis in ((speed, 0.0), (0.0, speed)):
+        assert samples.take(reading(T_NS + PERIOD_NS, vel=axis), armed=True) is Event.NONE
+        assert samples.vel == (0.0, 0.0)
+    assert samples.take(reading(T_NS + PERIOD_NS, (9.0, -2.0)), armed=True) is not Event.DRIVE_ARMED
+    assert samples.pos == before
+
+
+@pytest.mark.parametrize("in_a_row", [True, False])
+def test_a_few_odd_samples_in_a_row_and_the_position_is_lost(
+    samples: JointEstimate, in_a_row: bool
+) -> None:
+    """Those that are not in a row are only left out."""
+    events = []
+    for k in range(1, REJECTED_MAX + 1 if in_a_row else 4 * REJECTED_MAX):
+        pos = (5.0 if in_a_row or k % REJECTED_MAX else 1.0, -2.0)
+        events.append(samples.take(reading(T_NS + k * PERIOD_NS, pos), armed=True))
+    assert (Event.POSITION_LOST in events) is in_a_row
+    assert events[: REJECTED_MAX - 1] == [Event.NONE] * (REJECTED_MAX - 1)
+    assert samples.pos == (1.0, -2.0)
+
+
+def test_a_module_that_is_not_controlled_may_be_found_anywhere(samples: JointEstimate) -> None:
+    """An axis that disarms is reported even by an odd sample."""
+    odd = reading(T_NS + PERIOD_NS, (9.0, 9.0), status=DriveStatus.ERROR)
+    for armed in (True, False):
+        assert samples.take(odd, armed=armed) is Event.DRIVE_DISARMED
+        assert samples.pos == ((1.0, -2.0) if armed else (9.0, 9.0))
+
+
+@pytest.mark.parametrize(
+    ("status", "event"),
+    [(DriveStatus.LOST, Event.DRIVE_LOST), (DriveStatus.UNZEROED, Event.POSITION_LOST)],
+)
+def test_a_position_that_is_old_or_means_nothing_is_not_taken(
+    samples: JointEstimate, status: DriveStatus, event: Event
+) -> None:
+    for armed in (True, False):
+        assert samples.take(
+            reading(T_NS + PERIOD_NS, (-63.0, -62.0), status=status), armed=armed
+        ) is (event)
+    assert samples.pos == (1.0, -2.0)
+    assert samples.status is status
+
+
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_drive_without_a_zero_may_lack_turns_on_both_axes_if_it_was_controlled(
+    samples: JointEstimate, armed: bool
+) -> None:
+    """Only a joint that nobody controls has moved by a jump."""
+    jumped = JointEstimate(N)
+    jumped.take(reading(T_NS), armed=True)
+    jumped.take(reading(T_NS + PERIOD_NS, (9.0, 9.0)), armed=armed)
+    assert (jumped.first.moved, jumped.second.moved) == (not armed, not armed)
+    samples.take(reading(T_NS + PERIOD_NS, status=DriveStatus.UNZEROED), armed=armed)
+    assert (samples.first.lost, samples.second.lost, samples.accepted_ns) == (armed, armed, 0)
+
+
+@given(speed=st.floats(-40.0, 40.0), gained=st.floats(-8.0, 8.0), gap_ms=st.integers(1, 100))
+def test_a_joint_that_moves_as_legs_do_is_right(speed: float, gained: float, gap_ms: int) -> None:
+    samples = JointEstimate(N)
+    samples.take(reading(T_NS, vel=(speed, 0.0)), armed=True)
+    dt = gap_ms * 1e-3
+    pos = (1.0 + (speed + gained * dt / 0.1) * dt, -2.0)
+    later = reading(T_NS + gap_ms * NS_PER_MS, pos)
+    assert samples.take(later, armed=True) is Event.DRIVE_ARMED

@@ -20,9 +20,8 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Restart, Scenario
 from shared.robot.trip_table import JOINT_TRIPS
 from tools.lab.studies.sweeps.figures import event_steps_nm
-from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.lockstep import FleetMoment, Lockstep, begin_standing, standing
 from tools.sim.network import BASE
-from tools.sim.standing_start import begin_standing, standing
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "deploy" / "scenarios"
 

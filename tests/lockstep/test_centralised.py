@@ -12,10 +12,9 @@ import pytest
 from services.joint import pd_law
 from services.joint.differential import joint_torque
 from services.joint.drive_manager import DriveAction, DriveCommand
-from services.joint.drivers.base import DriveStatus
 from services.planner.planner import Planner
 from services.simulator.physics.plant import IDEAL, PlantConfig
-from shared.bus.messages import JointState, Mode, Pair, PlannerMode
+from shared.bus.messages import DriveStatus, JointState, Mode, Pair, PlannerMode
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
@@ -26,9 +25,9 @@ from tests.joint.helpers import ModuleBench, command
 from tests.lockstep import runs
 from tests.lockstep.runs import push, variant
 from tests.planner.states import state
+from tests.robots import ROBOT
 from tools import cli
-from tools.sim.centralised.control import CentralPlanner, PassThrough
-from tools.sim.centralised.fleet import CONTROLS, SHIPPED, torques_only
+from tools.sim.centralised import CONTROLS, SHIPPED, CentralPlanner, PassThrough, torques_only
 from tools.sim.lockstep import Lockstep
 
 TAU: Pair = (3.0, -41.0)
@@ -42,32 +41,22 @@ def run(
     return runs.run(robot, scenario, 0.0, plant, stands=stands, fleet_type=fleet_type).rows
 
 
-@pytest.fixture(scope="module")
-def beginning() -> Scenario:
-    """The first of the squat's way down, with the hand's largest force, and a push."""
-    return variant("squat", duration=1.6, kill=(), push=(push(0.8, 30.0, 20.0, 0.0),))
+def test_without_delay_it_does_what_the_distributed_control_does() -> None:
+    """The first of the squat's way down, with the hand's largest force, and a push.
 
-
-@pytest.fixture(scope="module")
-def distributed(robot: RobotConfig, beginning: Scenario) -> list[SimTruth]:
-    """Torques only there as well, from joint services that have the law."""
-    return run("distributed", torques_only(robot), beginning, IDEAL)
-
-
-def test_without_delay_it_does_what_the_distributed_control_does(
-    robot: RobotConfig, beginning: Scenario, distributed: list[SimTruth]
-) -> None:
-    centralised = run("centralised", robot, beginning, IDEAL)
-    assert len(centralised) == len(distributed)
-    for name, unit, far in (("com", 1e3, 1.0), ("torso", 1e3, 1.0), ("angles", 1.0, 0.002)):
-        a, b = (
-            unit * np.array([getattr(r, name) for r in rows]) for rows in (centralised, distributed)
-        )
-        assert np.abs(a - b).max() < far, name
-    com, hand = (
-        [1e3 * max(np.hypot(*row.com[:2]) for row in rows) for rows in (centralised, distributed)],
-        [max(abs(r.operator_force[2]) for r in rows) for rows in (centralised, distributed)],
+    Joint services that have the law write torques only there as well.
+    """
+    beginning = variant("squat", duration=1.6, kill=(), push=(push(0.8, 30.0, 20.0, 0.0),))
+    both = (
+        run("centralised", ROBOT, beginning, IDEAL),
+        run("distributed", torques_only(ROBOT), beginning, IDEAL),
     )
+    assert len(both[0]) == len(both[1])
+    for name, unit, far in (("com", 1e3, 1.0), ("torso", 1e3, 1.0), ("angles", 1.0, 0.002)):
+        a, b = (unit * np.array([getattr(row, name) for row in rows]) for rows in both)
+        assert np.abs(a - b).max() < far, name
+    com = [1e3 * max(np.hypot(*row.com[:2]) for row in rows) for rows in both]
+    hand = [max(abs(row.operator_force[2]) for row in rows) for rows in both]
     assert com[1] > 8.0, "the push is felt"
     assert com[0] == pytest.approx(com[1], abs=0.5)
     assert hand[1] > 12.0, "the hand leads"
@@ -75,10 +64,10 @@ def test_without_delay_it_does_what_the_distributed_control_does(
 
 
 @pytest.mark.parametrize(("control", "falls"), [("centralised", True), ("distributed", False)])
-def test_at_100_ms_only_the_shipped_stands(robot: RobotConfig, control: str, falls: bool) -> None:
+def test_at_100_ms_only_the_shipped_stands(control: str, falls: bool) -> None:
     late = (Inject(link="all", at=0.05, delay_ms=100.0),)
     happens = {"kill": (), "inject": late, "push": (push(0.2, 40.0, 0.0, 0.0),)}
-    rows = run(control, robot, variant("squat", duration=2.5, **happens))
+    rows = run(control, ROBOT, variant("squat", duration=2.5, **happens))
     assert rows[-1].fallen is falls
 
 
@@ -106,11 +95,12 @@ class Bench(ModuleBench):
 
 
 @pytest.fixture
-def bench(robot: RobotConfig) -> Bench:
-    return Bench(robot)
+def bench() -> Bench:
+    return Bench(ROBOT)
 
 
 def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench: Bench) -> None:
+    """Also one made from an old state. Of the gate the torque diamond is left, in one cycle."""
     assert bench.torque_of(bench.passes((5.0, -60.0))) == pytest.approx((5.0, -60.0))
     for _ in range(500):  # 1 s, where the shipped module holds after 50 ms
         step = bench.cycle()
@@ -119,35 +109,28 @@ def test_a_torque_goes_to_the_drive_unchanged_until_the_next_however_long(bench:
     assert bench.mode is Mode.TRACK
     step = bench.passes((math.nan, 0.0))
     assert bench.torque_of(step) == pytest.approx((5.0, -60.0)), "NaN is not passed on"
-
-
-def test_a_torque_made_from_an_old_state_is_taken(bench: Bench) -> None:
     step = bench.passes((1.0, -2.0), age_ns=400 * NS_PER_MS)
     assert bench.torque_of(step) == pytest.approx((1.0, -2.0))
-    assert bench.module.controller.state(bench.now_ns).age_ns == 400 * NS_PER_MS
+    assert (
+        bench.module.controller.state(bench.module.state.controller, bench.now_ns).age_ns
+        == 400 * NS_PER_MS
+    )
+    for asked, given in (((0.0, -500.0), (0.0, -115.6)), ((80.0, 80.0), (57.8, 57.8))):
+        assert bench.torque_of(bench.passes(asked)) == pytest.approx(given)
 
 
-@pytest.mark.parametrize(
-    ("asked", "given"), [((0.0, -500.0), (0.0, -115.6)), ((80.0, 80.0), (57.8, 57.8))]
-)
-def test_of_the_gate_the_torque_diamond_is_left(bench: Bench, asked: Pair, given: Pair) -> None:
-    """In one cycle: no limit on its step."""
-    assert bench.torque_of(bench.passes(asked)) == pytest.approx(given)
-
-
-def test_an_estop_and_a_lost_drive_are_as_shipped(robot: RobotConfig, bench: Bench) -> None:
+def test_an_estop_and_a_lost_drive_are_as_shipped(bench: Bench) -> None:
     bench.cycle(estop=True)
     assert bench.mode is Mode.DAMP
-    other = Bench(robot)
-    other.status = DriveStatus.LOST
-    other.passes(TAU)
-    assert other.mode is Mode.FAULT
-    assert other.passes(TAU).command is not DriveCommand.TORQUE
+    bench.status = DriveStatus.LOST
+    bench.passes(TAU)
+    assert bench.mode is Mode.FAULT
+    assert bench.passes(TAU).command is not DriveCommand.TORQUE
 
 
-def receive(robot: RobotConfig, now_ns: int, seq: int, *planners: Planner) -> list[JointState]:
+def receive(now_ns: int, seq: int, *planners: Planner) -> list[JointState]:
     """Have planners receive six states of a robot that stands on its feet, each joint moving."""
-    q = np.array(stand_pose(robot, 1.1))
+    q = np.array(stand_pose(ROBOT, 1.1))
     own = {"t_ns": now_ns, "session": 1, "age_ns": 2 * NS_PER_MS}
     states = [state(i, q, seq, v=(0.01 * i, -0.03 * i), **own) for i in range(N_MODULES)]
     for planner, (index, each) in itertools.product(planners, enumerate(states)):
@@ -155,12 +138,12 @@ def receive(robot: RobotConfig, now_ns: int, seq: int, *planners: Planner) -> li
     return states
 
 
-def test_a_command_is_all_of_the_shipped_one_as_a_torque(robot: RobotConfig) -> None:
-    shipped, central = Planner(robot, 1), CentralPlanner(robot, 1)
+def test_a_command_is_all_of_the_shipped_one_as_a_torque() -> None:
+    shipped, central = Planner(ROBOT, 1), CentralPlanner(ROBOT, 1)
     now = NS_PER_S
     for seq in range(1, 4):
         now += 4 * NS_PER_MS
-        received = receive(robot, now, seq, shipped, central)
+        received = receive(now, seq, shipped, central)
         for seen, whole, parts in zip(received, central.tick(now), shipped.tick(now), strict=True):
             wanted = pd_law.torque(pd_law.extrapolate(parts, 0.0), seen.q, seen.v)
             assert whole.tau_ff == pytest.approx(wanted, abs=1e-12)
@@ -170,10 +153,10 @@ def test_a_command_is_all_of_the_shipped_one_as_a_torque(robot: RobotConfig) -> 
             assert whole.echo_t_ns == parts.echo_t_ns
 
 
-def test_once_it_leads_the_planner_leads_whatever_it_receives(robot: RobotConfig) -> None:
+def test_once_it_leads_the_planner_leads_whatever_it_receives() -> None:
     modes = []
-    for planner in (Planner(robot, 1), CentralPlanner(robot, 1)):
-        receive(robot, NS_PER_S, 1, planner)
+    for planner in (Planner(ROBOT, 1), CentralPlanner(ROBOT, 1)):
+        receive(NS_PER_S, 1, planner)
         for tick in range(3):
             planner.tick(NS_PER_S + tick * 4 * NS_PER_MS)
         assert planner.status(NS_PER_S, 0.0).mode == PlannerMode.LEADING

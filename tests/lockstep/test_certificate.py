@@ -14,13 +14,10 @@ from tools.lab.studies.sweeps.certificate_trial import CertificateCase, Certific
 
 SEED = 1
 
-
 DRAWN = 300
-
 
 CLEAR = 0.1
 """Fraction of K_required; nearer to zero the floor's own elasticity may decide."""
-
 
 TRIED = 5
 """The nearest on either side."""

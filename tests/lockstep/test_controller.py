@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.planner.controller import Action, Observation
-from services.planner.controller_file import controller_maker
+from services.planner.controller import Action, Observation, controller_maker
 from services.planner.law.hocca import LawOutput
 from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus import topics
@@ -22,11 +21,11 @@ from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import Run, kill, modes_of, push, run, standing_as, still
 from tests.planner.states import with_law
+from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
 
 LQR = Path(__file__).parents[2] / "examples" / "lqr_controller.py"
-
 
 BEGINS_S = 0.3
 
@@ -79,8 +78,8 @@ CHANGES: dict[str, Callable[[Observation, Action], Action]] = {
 
 
 def fleet_of(
-    robot: RobotConfig, duration: float, change: Callable[[Observation, Action], Action] | None,
-    **how: Any,
+    duration: float, change: Callable[[Observation, Action], Action] | None,
+    robot: RobotConfig = ROBOT, **how: Any,
 ) -> Run:  # fmt: skip
     """Run with a controller of one's own that changes the shipped law's action, or with none."""
     controller = None if change is None else lambda: Own(change)
@@ -89,23 +88,23 @@ def fleet_of(
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", CHANGES)
-def test_whatever_it_does_the_robot_stands(robot: RobotConfig, name: str) -> None:
-    outcome = fleet_of(robot, 3.5, CHANGES[name])
+def test_whatever_it_does_the_robot_stands(name: str) -> None:
+    outcome = fleet_of(3.5, CHANGES[name])
     assert outcome.stood
     assert abs(outcome.rows[-1].over[0]) < 0.08
 
 
-def test_one_that_changes_nothing_is_the_shipped_law_to_the_last_bit(robot: RobotConfig) -> None:
-    start = standing_as(robot)
-    robot = with_law(robot, push_integral_max=0.0)  # the integral would wind up against another law
+def test_one_that_changes_nothing_is_the_shipped_law_to_the_last_bit() -> None:
+    start = standing_as(ROBOT)
+    robot = with_law(ROBOT, push_integral_max=0.0)  # the integral would wind up against another law
     mine, shipped = (
-        fleet_of(robot, 0.8, change, start=start) for change in (lambda _, action: action, None)
+        fleet_of(0.8, change, robot, start=start) for change in (lambda _, action: action, None)
     )
     assert mine.com_mm.tolist() == shipped.com_mm.tolist()
 
 
-def test_one_that_raises_is_told_and_not_asked_again(robot: RobotConfig) -> None:
-    outcome = fleet_of(robot, 2.0, wrong)
+def test_one_that_raises_is_told_and_not_asked_again() -> None:
+    outcome = fleet_of(2.0, wrong)
     assert outcome.stood
     assert outcome.status.mode == PlannerMode.UNCERTIFIED
     assert outcome.status.why == "the controller raised RuntimeError: lost"
@@ -114,7 +113,7 @@ def test_one_that_raises_is_told_and_not_asked_again(robot: RobotConfig) -> None
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(3))
-def test_the_examples_lqr_stands_through_pushes_and_kill(robot: RobotConfig, number: int) -> None:
+def test_the_examples_lqr_stands_through_pushes_and_kill(number: int) -> None:
     plant = plants.draw(f"lqr {number}") if number else PlantConfig()
     pushes = (push(0.5, 30.0, 0.0, 0.0), push(2.5, 30.0, 0.0, 0.0))
     tracked: list[bool] = []
@@ -122,12 +121,12 @@ def test_the_examples_lqr_stands_through_pushes_and_kill(robot: RobotConfig, num
     def look(fleet: Lockstep, row: SimTruth) -> None:
         tracked.append(row.scenario_s < 1.5 and set(modes_of(fleet)) == {Mode.TRACK})
 
-    scenario, lqr = still(4.0, push=pushes, kill=kill(1.5)), controller_maker(str(LQR), robot)
-    assert run(robot, scenario, plant=plant, controller=lqr, each=look).stood
+    scenario, lqr = still(4.0, push=pushes, kill=kill(1.5)), controller_maker(str(LQR), ROBOT)
+    assert run(ROBOT, scenario, plant=plant, controller=lqr, each=look).stood
     assert sum(tracked) > 140 or number, "on the realistic plant it leads until it is killed"
 
 
-def test_its_output_is_what_is_sent(robot: RobotConfig) -> None:
+def test_its_output_is_what_is_sent() -> None:
     """Not the shipped law's beside it."""
     outputs: list[LawOutput] = []
 
@@ -141,15 +140,15 @@ def test_its_output_is_what_is_sent(robot: RobotConfig) -> None:
         if topic is topics.JOINT_COMMAND and module == "knee_left":
             sent.append(message.tau_coupled)  # type: ignore[attr-defined]  # a command
 
-    fleet_of(robot, 0.6, push_forward, record=record)
+    fleet_of(0.6, push_forward, record=record)
     assert sent[-1][0] == outputs[-1].tau_coupled[8] + 0.25
 
 
-def test_on_a_slope_it_is_followed_as_on_the_level(robot: RobotConfig) -> None:
+def test_on_a_slope_it_is_followed_as_on_the_level() -> None:
     """Where the COM is uphill of the ankles it is over them."""
     plant = changed(PlantConfig(), {"floor.slope": [0.06, 0.0]})
-    lqr = controller_maker(str(LQR), robot)
-    outcome = run(with_imu(robot), still(2.0), plant=plant, controller=lqr)
+    lqr = controller_maker(str(LQR), ROBOT)
+    outcome = run(with_imu(ROBOT), still(2.0), plant=plant, controller=lqr)
     assert outcome.stood
     assert set(outcome.modes) == {Mode.TRACK}
     assert abs(outcome.rows[-1].com[0]) > 0.03, "it stands uphill of its ankles"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import msgspec
@@ -19,10 +20,10 @@ from shared.exceptions import FleetError
 from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import Run, kill, led_to, modes_of, push, run, still
 from tests.planner.states import with_law
-from tools.fleet.descent import LIGHT_FRACTION, Ask, Descent, Phase
+from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.live.descent import LIGHT_FRACTION, Ask, Descent, Phase
+from tools.sim.lockstep import Lockstep, begin_standing
 
 AT_S = 0.3
 HEARD_S = 0.1
@@ -37,10 +38,8 @@ class Descending(Lockstep):
         interrupt: Ctrl-C at a scenario's time.
     """
 
-    wait_s = 5.0
-
-    def __init__(self, robot: RobotConfig, *args: Any, **how: Any) -> None:
-        self.descent = Descent(robot, wait_s=self.wait_s)
+    def __init__(self, robot: RobotConfig, *args: Any, wait_s: float, **how: Any) -> None:
+        self.descent = Descent(robot, wait_s=wait_s)
         self.states: list[JointState | None] = [None] * len(MODULES)
         self.status: PlannerStatus | None = None
         self.asks: list[Ask] = []
@@ -77,19 +76,13 @@ class Descending(Lockstep):
         return ask
 
 
-class Impatient(Descending):
-    """Nothing is going to bear its weight."""
-
-    wait_s = 1.0
-
-
 def go_down(
     robot: RobotConfig,
     scenario: Scenario,
     plant: PlantConfig | None = None,
     each: Any = lambda _fleet, _row: None,
     interrupt_s: float = np.inf,
-    fleet_type: type[Descending] = Descending,
+    wait_s: float = 5.0,
 ) -> Run:
     """Type `xrl down` at `AT_S`; go on for half a second after its end."""
     ended: list[float] = []
@@ -103,7 +96,8 @@ def go_down(
             ended.append(row.scenario_s)
         return bool(ended) and row.scenario_s > ended[0] + 0.5
 
-    outcome = run(robot, scenario, plant=plant, fleet_type=fleet_type, each=look)
+    how = {"fleet_type": functools.partial(Descending, wait_s=wait_s), "each": look}
+    outcome = run(robot, scenario, plant=plant, **how)
     assert not outcome.rows[-1].fallen
     on_feet = [row for row in outcome.rows if row.hoist == 0.0]
     assert max(max(row.foot_left_tilt, row.foot_right_tilt) for row in on_feet) < 0.05
@@ -145,17 +139,17 @@ def hang(fleet: Descending, row: SimTruth) -> None:
 
 @pytest.mark.sampled(20)
 @pytest.mark.parametrize("number", range(20))
-def test_it_goes_down_and_holds_until_a_hoist_bears_it(robot: RobotConfig, number: int) -> None:
-    found = go_down(robot, alone(), plants.draw(f"down {number}"), hang)
+def test_it_goes_down_and_holds_until_a_hoist_bears_it(number: int) -> None:
+    found = go_down(ROBOT, alone(), plants.draw(f"down {number}"), hang)
     assert found.lockstep.asks[-1] is Ask.IDLE
     assert found.rows[-1].hoist == 1.0, "not before"
     assert found.sinking < 0.2
     assert found.height.min() < 0.85, "the lowest pose"
 
 
-def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig) -> None:
+def test_with_nothing_to_bear_it_it_holds_and_says_what_helps() -> None:
     """Idled there it tips: the torso meets the floor at 2.8 m/s, as from a stand."""
-    found = go_down(robot, alone(), fleet_type=Impatient)
+    found = go_down(ROBOT, alone(), wait_s=1.0)
     assert found.sinking < 0.2
     assert "still holds: the legs bear 9" in found.lockstep.error
     assert "stand under its torso" in found.lockstep.error
@@ -165,24 +159,24 @@ def test_with_nothing_to_bear_it_it_holds_and_says_what_helps(robot: RobotConfig
     assert 2.3 < floor_speed(found.lockstep) < 3.5
 
 
-def test_idled_in_a_stand_it_meets_the_floor_as_hard(robot: RobotConfig) -> None:
+def test_idled_in_a_stand_it_meets_the_floor_as_hard() -> None:
     """2.9 m/s from 1.19 m; from its lowest pose, 0.82 m, see above."""
-    fleet = Lockstep(robot, alone())
+    fleet = Lockstep(ROBOT, alone())
     assert begin_standing(fleet)
     assert 2.3 < floor_speed(fleet) < 3.5
 
 
-def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one(robot: RobotConfig) -> None:
-    led = with_law(robot, load_correction=(0.0, 0.0))  # whatever it carries
+def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one() -> None:
+    led = with_law(ROBOT, load_correction=(0.0, 0.0))  # whatever it carries
     light = changed(PlantConfig(), {"body.payload_scale": 0.0})
-    found = go_down(led, alone(kill=kill(0.1)), light, fleet_type=Impatient)
+    found = go_down(led, alone(kill=kill(0.1)), light, wait_s=1.0)
     assert "still holds: the legs bear" in found.lockstep.error
     assert found.lockstep.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING]
     assert LIGHT_FRACTION < 0.5, "what it still bears"
 
 
-def test_a_planner_that_dies_on_the_way_does_not_keep_it_up(robot: RobotConfig) -> None:
-    found = go_down(robot, alone(kill=kill(2.8)), each=hang)
+def test_a_planner_that_dies_on_the_way_does_not_keep_it_up() -> None:
+    found = go_down(ROBOT, alone(kill=kill(2.8)), each=hang)
     assert Ask.SIT in found.lockstep.asks
     assert found.lockstep.asks[-3:] == [Ask.STOP, Ask.NOTHING, Ask.IDLE], "it sinks in DAMP"
     assert found.sinking < 0.2
@@ -190,7 +184,7 @@ def test_a_planner_that_dies_on_the_way_does_not_keep_it_up(robot: RobotConfig) 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("at", [1.8, 3.8])
-def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> None:
+def test_interrupted_it_stands_where_it_is(at: float) -> None:
     heights = []
 
     def stop(fleet: Descending, row: SimTruth) -> None:
@@ -198,28 +192,28 @@ def test_interrupted_it_stands_where_it_is(robot: RobotConfig, at: float) -> Non
             fleet.error = fleet.error or "interrupted"
             heights.append(row.torso[2])
 
-    found = go_down(robot, alone(), each=stop, interrupt_s=at)
+    found = go_down(ROBOT, alone(), each=stop, interrupt_s=at)
     assert heights[0] - found.height[-1] < 0.05
     assert found.height[-1] > 0.9
     assert not {*modes_of(found.lockstep)} - {Mode.TRACK, Mode.HOLD}
 
 
-def test_a_hand_that_holds_it_up_is_not_pressed_down(robot: RobotConfig) -> None:
-    found = go_down(robot, still(40.0))
+def test_a_hand_that_holds_it_up_is_not_pressed_down() -> None:
+    found = go_down(ROBOT, still(40.0))
     assert "held up" in found.lockstep.error
     assert max(abs(row.operator_force[2]) for row in found.rows) < 95.0
     assert found.height[-1] > 1.05
 
 
-def test_a_person_who_goes_along_takes_it_down(robot: RobotConfig) -> None:
+def test_a_person_who_goes_along_takes_it_down() -> None:
     scenario = led_to((AT_S, 1.188), (AT_S + 6.0, 0.83), duration=40.0)
-    found = go_down(robot, scenario, each=hang)
+    found = go_down(ROBOT, scenario, each=hang)
     assert found.lockstep.asks[-1] is Ask.IDLE
 
 
 @pytest.mark.sampled(8)
 @pytest.mark.parametrize("number", range(8))
-def test_pushed_on_its_way_it_does_not_tip(robot: RobotConfig, number: int) -> None:
+def test_pushed_on_its_way_it_does_not_tip(number: int) -> None:
     pushes = (push(2.3, 30.0, 0.0, 0.0), push(3.3, 0.0, 30.0, 0.0), push(4.8, -30.0, 0.0, 0.0))
-    found = go_down(robot, alone(push=pushes), plants.draw(f"pushed {number}"), hang)
+    found = go_down(ROBOT, alone(push=pushes), plants.draw(f"pushed {number}"), hang)
     assert found.lockstep.asks[-1] is Ask.IDLE

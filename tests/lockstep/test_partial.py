@@ -4,7 +4,7 @@ Each of the four kinds has 63 subsets, at 1.2 s of CPU each: all 252 take five m
 
     XRL_ALL_SUBSETS=1 ./deploy/test tests/lockstep/test_partial.py
 
-and by default 32 of them: of links cut and services frozen each module alone, each leg, four
+and by default 33 of them: none, of links cut and services frozen each module alone, each leg, four
 drawn by a fixed seed and all six at once; of either direction alone two drawn and all six. Every
 case goes on from one moment of one run, so that none has to stand up first. The push is to the
 front left, so a subset is not its own mirror image, and no symmetry is counted on.
@@ -24,11 +24,11 @@ from services.planner.watch.engagement_fsm import GRACE_NS, WAITS_NS
 from shared.bus.messages import Mode, Pair, PlannerStatus
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Kill, Scenario
 from shared.joints import MODULE_INDEX, MODULES, SIDES
 from shared.links import Pair as Link
 from tests.lockstep.runs import Heard, led_to, modes_of, moment_of, push, restart, run
+from tests.robots import ROBOT
 from tests.shared.mcap_log.runs import sample as sample_of
 from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 from tools.sim.lockstep import FleetMoment, Lockstep
@@ -65,10 +65,6 @@ def sample(kind: str) -> list[PartialCase]:
     others = [modules for modules in SUBSETS if modules not in always]
     drawn = random.Random(f"partial {kind}").sample(others, KINDS[kind])
     return [PartialCase(kind, modules) for modules in (*always, *drawn)]
-
-
-def words(case: PartialCase) -> str:
-    return f"{case.kind}-{'+'.join(case.modules)}"
 
 
 def scenario_of(case: PartialCase) -> Scenario:
@@ -111,30 +107,21 @@ class PartialFleet(Lockstep):
         return joint_torque((a * a_sign, b * b_sign), self.config.joint.gear_ratio)
 
 
-class Outcome(NamedTuple):
-    """The figures of a case; None where there was nothing of the kind."""
-
-    stood: bool
-    """Neither fallen nor, at the end, tipping."""
-    hold_shown_ms: float | None
-    """From the cut to the first planner status that says `hold`."""
-    track_left_ms: float | None
-    """From the cut to when the last module left TRACK; None: one never did before the heal."""
-    led_again_s: float | None
-    """From the heal until all six track under a planner that leads; None: not by the end."""
-    torque_step_nm: float
-    """Largest step of a joint's torque at a change of mode, as the drives give it."""
-    com_max_mm: float
-    """Largest horizontal distance of the COM from between the ankles."""
-    operator_end_n: float
-    """Most of the hand, vertical, in the run's last `LAST_S`, with all six back in TRACK.
-
-    While they HOLD it leads on against them and comes to its limit, whatever failed.
-    """
+@pytest.fixture(scope="module")
+def start() -> FleetMoment:
+    return moment_of(ROBOT, scenario_of(PartialCase("links", ())), BEGIN_S)
 
 
-def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> Outcome:
-    """Go on from the common moment, with the case's failure, to its end or to the fall."""
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize(
+    "case",
+    [PartialCase("links", ()), *(case for kind in KINDS for case in sample(kind))],
+    ids=lambda case: f"{case.kind}-{'+'.join(case.modules)}",
+)
+def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_again(
+    case: PartialCase, start: FleetMoment
+) -> None:
+    """With nothing failed no module holds."""
     statuses = Heard(PlannerStatus)
     led_s: list[float] = []
 
@@ -146,79 +133,42 @@ def run_case(case: PartialCase, robot: RobotConfig, start: FleetMoment) -> Outco
             led_s.append(row.scenario_s - HEAL_S)
 
     scenario, how = scenario_of(case), {"fleet_type": PartialFleet, "record": statuses}
-    fleet, rows = run(robot, scenario, start=start, each=look, **how)
+    fleet, rows = run(ROBOT, scenario, start=start, each=look, **how)
+    assert ending_of(rows[-1], END_S, ROBOT) is Ending.STOOD
     begin_ns = rows[0].t_ns - round(rows[0].scenario_s * NS_PER_S)
     cut_ns, heal_ns = (begin_ns + round(at * NS_PER_S) for at in (CUT_S, HEAL_S))
-    held = [status.t_ns for status in statuses if status.hold and status.t_ns >= cut_ns]
-    left = {
-        name: event.t_ns
+    held_ms = [(s.t_ns - cut_ns) / NS_PER_MS for s in statuses if s.hold and s.t_ns >= cut_ns]
+    left_ms = {
+        name: (event.t_ns - cut_ns) / NS_PER_MS
         for name, event in fleet.events
         if event.mode_before == Mode.TRACK and cut_ns <= event.t_ns < heal_ns
     }
+    # while they HOLD the hand leads on against them and comes to its limit, whatever failed
+    operator_n = operator_peak_n([r for r in rows if r.scenario_s > rows[-1].scenario_s - LAST_S])
+    if not case.modules:
+        assert (held_ms, left_ms, fleet.torque_step_nm) == ([], {}, 0.0)
+        assert operator_n < 20.0
+        return
+    age_ms = ROBOT.joint_service.max_command_age_ms
+    assert held_ms[0] <= age_ms + 10.0, "hold_all is in the planner's status"
     # a frozen service changes no mode: its drive keeps the last target
     awake = set(MODULES) - set(case.modules if case.kind == "frozen" else ())
-    all_left = bool(left) and awake <= set(left)
-    last = [row for row in rows if row.scenario_s > rows[-1].scenario_s - LAST_S]
-    return Outcome(
-        stood=ending_of(rows[-1], END_S, robot) is Ending.STOOD,
-        hold_shown_ms=(held[0] - cut_ns) / NS_PER_MS if held else None,
-        track_left_ms=(max(left.values()) - cut_ns) / NS_PER_MS if all_left else None,
-        led_again_s=led_s[0] if led_s else None,
-        torque_step_nm=fleet.torque_step_nm,
-        com_max_mm=com_max_mm(rows),
-        operator_end_n=operator_peak_n(last),
-    )
+    assert awake <= set(left_ms)
+    assert max(left_ms.values(), default=0.0) <= age_ms + GRACE_NS / NS_PER_MS
+    assert led_s[0] <= WAITS_NS[1] / NS_PER_S
+    assert fleet.torque_step_nm <= 5.0
+    assert com_max_mm(rows) < 110.0, "90 measured with a leg frozen, of 127 to the sole's end"
+    assert operator_n < 75.0, "44 to 50 measured: it leads, and is not at its limit"
 
 
-@pytest.fixture(scope="module")
-def start(robot: RobotConfig) -> FleetMoment:
-    return moment_of(robot, scenario_of(PartialCase("links", ())), BEGIN_S)
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("case", [case for kind in KINDS for case in sample(kind)], ids=words)
-def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_again(
-    case: PartialCase, robot: RobotConfig, start: FleetMoment
-) -> None:
-    outcome = run_case(case, robot, start)
-    age_ms = robot.joint_service.max_command_age_ms
-    assert outcome.stood
-    assert outcome.hold_shown_ms is not None
-    assert outcome.hold_shown_ms <= age_ms + 10.0, "hold_all is in the planner's status"
-    all_frozen = case.kind == "frozen" and len(case.modules) == len(MODULES)
-    if not all_frozen:  # then no service is left that could leave TRACK
-        assert outcome.track_left_ms is not None
-        assert outcome.track_left_ms <= age_ms + GRACE_NS / NS_PER_MS
-    assert outcome.led_again_s is not None
-    assert outcome.led_again_s <= WAITS_NS[1] / NS_PER_S
-    assert outcome.torque_step_nm <= 5.0
-    assert outcome.com_max_mm < 110.0, "90 measured with a leg frozen, of 127 to the sole's end"
-    assert outcome.operator_end_n < 75.0, "44 to 50 measured: it leads, and is not at its limit"
-
-
-def test_with_nothing_failed_no_module_holds(robot: RobotConfig, start: FleetMoment) -> None:
-    outcome = run_case(PartialCase("links", ()), robot, start)
-    assert outcome.stood
-    assert outcome.hold_shown_ms is None
-    assert outcome.track_left_ms is None
-    assert outcome.torque_step_nm == 0.0
-    assert outcome.operator_end_n < 20.0
-
-
-@pytest.mark.parametrize(
-    ("changes", "ending"),
-    [
+def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood() -> None:
+    good = {"scenario_s": END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
+    good |= {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
+    for changes, ending in (
         ({}, Ending.STOOD),
         ({"fallen": True}, Ending.FELL),
         ({"foot_left_tilt": 0.06}, Ending.TIPPING),
         ({"com": (0.13, 0.0, 1.0)}, Ending.TIPPING),
         ({"scenario_s": END_S - 0.5}, Ending.FELL),
-    ],
-)
-def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood(
-    changes: dict[str, object], ending: Ending, robot: RobotConfig
-) -> None:
-    good = {"scenario_s": END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
-    flat = {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
-    row = sample_of(SimTruth, **(good | flat | changes))
-    assert ending_of(row, END_S, robot) is ending
+    ):
+        assert ending_of(sample_of(SimTruth, **(good | changes)), END_S, ROBOT) is ending

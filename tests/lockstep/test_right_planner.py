@@ -15,15 +15,15 @@ import pytest
 
 from services.joint.envelope import Envelope
 from services.joint.failsafe import Failsafe
-from services.planner.watch.trips import PlannerTrips
+from services.planner.watch.trips import PlannerTrips, TripsState
 from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import Cause, Mode, Outside, PlannerMode, Trip
 from shared.bus.traces import SimTruth
 from shared.config.impairment import Impairment
-from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Push, Scenario
 from shared.robot.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import Run, kill, led_to, push, restart, run, variant
+from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
 from tools.lab.studies.sweeps.push_range import PushRange
 from tools.sim.lockstep import Lockstep
@@ -48,10 +48,10 @@ class Judged:
                 self.outside[found.name] += 1
             return found
 
-        def watching(own: PlannerTrips, *rest: Any, **more: Any) -> None:
-            advance(own, *rest, **more)
-            if own.state.tripped and own.state.tripped not in (Trip.EDGE, Trip.TIPPING):
-                self.tripped.append(own.state.why)
+        def watching(own: PlannerTrips, state: TripsState, *rest: Any, **more: Any) -> None:
+            advance(own, state, *rest, **more)
+            if state.tripped and state.tripped not in (Trip.EDGE, Trip.TIPPING):
+                self.tripped.append(state.why)
 
         def hearing(own: Failsafe, *rest: Any, **more: Any) -> Cause | None:
             cause = seen(own, *rest, **more)
@@ -70,11 +70,11 @@ def judged(monkeypatch: pytest.MonkeyPatch) -> Judged:
 
 
 def led(
-    judged: Judged, robot: RobotConfig, scenario: Scenario, network: Impairment = BASE,
+    judged: Judged, scenario: Scenario, network: Impairment = BASE,
     plant: PlantConfig | None = None, **how: Any,
 ) -> Run:  # fmt: skip
     """Run; assert that it never falls and that everything is believed."""
-    outcome = run(robot, scenario, network=network, plant=plant, **how)
+    outcome = run(ROBOT, scenario, network=network, plant=plant, **how)
     assert not outcome.rows[-1].fallen
     assert judged.leading > 500, "there was something to believe"
     assert judged.outside == {}
@@ -82,22 +82,20 @@ def led(
     return outcome
 
 
-def test_while_the_hand_leads_into_the_crawl(robot: RobotConfig, judged: Judged) -> None:
+def test_while_the_hand_leads_into_the_crawl(judged: Judged) -> None:
     pushes = (push(1.0, 0.0, 40.0, 0.0), push(2.0, 40.0, 0.0, 0.0))
-    led(judged, robot, variant("crawl", duration=3.5, kill=(), push=pushes))
+    led(judged, variant("crawl", duration=3.5, kill=(), push=pushes))
 
 
-def test_while_a_strong_hand_leads_up_within_a_second(robot: RobotConfig, judged: Judged) -> None:
+def test_while_a_strong_hand_leads_up_within_a_second(judged: Judged) -> None:
     low = 1.188 - 0.45
-    outcome = led(judged, robot, led_to((2.5, low), (3.0, low), (3.7, 1.188), duration=5.0))
+    outcome = led(judged, led_to((2.5, low), (3.0, low), (3.7, 1.188), duration=5.0))
     assert outcome.rising > 1.0, "it is led fast"
 
 
-def test_a_killed_planners_successor_takes_over_without_a_step(
-    robot: RobotConfig, judged: Judged
-) -> None:
+def test_a_killed_planners_successor_takes_over_without_a_step(judged: Judged) -> None:
     restarted = {"kill": kill(2.2), "restart": restart(2.8), "push": ()}
-    outcome = led(judged, robot, variant("squat", duration=5.0, **restarted))
+    outcome = led(judged, variant("squat", duration=5.0, **restarted))
     assert outcome.status.mode == PlannerMode.LEADING
     assert set(outcome.modes) == {Mode.TRACK}
     assert all(each.failsafe.dropouts.count == 1 for each in outcome.lockstep.controllers)
@@ -114,34 +112,34 @@ def test_a_killed_planners_successor_takes_over_without_a_step(
     ],
     ids=lambda network: f"{network.delay_ms:g}-{network.jitter_ms:g}-{network.loss:g}",
 )
-def test_over_a_bad_network(robot: RobotConfig, judged: Judged, network: Impairment) -> None:
+def test_over_a_bad_network(judged: Judged, network: Impairment) -> None:
     scenario = led_to(LOW, duration=40.0, push=(push(1.0, 0.0, 40.0, 0.0),))
 
     def enough(_fleet: Lockstep, row: SimTruth) -> bool:
         return row.scenario_s > 4.0 and judged.leading > 600
 
-    led(judged, robot, scenario, network, each=enough)
+    led(judged, scenario, network, each=enough)
 
 
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("number", range(4))
-def test_on_drawn_plants_pushed_hard(robot: RobotConfig, judged: Judged, number: int) -> None:
+def test_on_drawn_plants_pushed_hard(judged: Judged, number: int) -> None:
     angle = (0.0, math.pi, math.pi / 2, -2.0)[number]
-    hard = (PushRange(robot).push(2.0, 0.3, 0.75, angle),)
+    hard = (PushRange(ROBOT).push(2.0, 0.3, 0.75, angle),)
     scenario = led_to(LOW, duration=4.5, push=hard)
-    led(judged, robot, scenario, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
+    led(judged, scenario, Impairment(delay_ms=5.0), plants.draw(f"right planner {number}"))
 
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)])
 def test_held_off_centre_it_is_believed_and_leads_again(
-    robot: RobotConfig, judged: Judged, direction: tuple[float, float]
+    judged: Judged, direction: tuple[float, float]
 ) -> None:
     """Cut off as a push has moved it, it holds there; led again it begins from the middle."""
     x, y = (50.0 * part for part in direction)
     pushed = (Push(at=0.5, duration=0.4, force=(x, y, 0.0)),)
     cut = (Inject(link="planner->joints", at=0.8, partition=True, duration=1.0),)
-    outcome = led(judged, robot, variant("stand", duration=5.5, push=pushed, inject=cut))
+    outcome = led(judged, variant("stand", duration=5.5, push=pushed, inject=cut))
     away_mm = np.hypot(outcome.com_mm[:, 0], outcome.com_mm[:, 1])
     held = (outcome.t > 0.85) & (outcome.t < 1.8)
     assert away_mm[held].max() > 20.0, "it was off centre"

@@ -16,9 +16,9 @@ from scipy.signal import find_peaks
 
 from shared.bus.messages import Cause, Mode
 from shared.bus.traces import SimTruth
-from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Push, Scenario
 from tests.lockstep.runs import Run, led_to, modes_of, push, run, still, variant
+from tests.robots import ROBOT
 from tools.sim.lockstep import Lockstep
 
 
@@ -35,10 +35,8 @@ UNEVEN = {
     ),
 }
 
-
 IN_STEP = (push(2.4, 0.0, 40.0, 0.0), push(4.4, 0.0, 40.0, 0.0))
 """Two seconds apart: in step with the sway of the certified gains."""
-
 
 ALL_WAYS = (
     push(1.0, 28.0, 28.0, 0.0),
@@ -59,16 +57,16 @@ def assert_it_stood_and_tracked(result: Run) -> None:
 @pytest.mark.parametrize("pushes", [IN_STEP, ALL_WAYS], ids=["in_step", "all_ways"])
 @pytest.mark.parametrize("network", UNEVEN)
 def test_it_stands_through_pushes_while_all_six_track(
-    robot: RobotConfig, network: str, pushes: tuple[Push, ...]
+    network: str, pushes: tuple[Push, ...]
 ) -> None:
     scenario = variant("squat", duration=7.0, kill=(), push=pushes, inject=UNEVEN[network])
-    assert_it_stood_and_tracked(run(robot, scenario))
+    assert_it_stood_and_tracked(run(ROBOT, scenario))
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "hip_left"])
-def test_so_it_does_with_any_other_module_late(robot: RobotConfig, module: str) -> None:
+def test_so_it_does_with_any_other_module_late(module: str) -> None:
     happens = {"push": (push(2.4, 0.0, 60.0, 0.0),), "inject": one_late(module, 22.0)}
-    assert_it_stood_and_tracked(run(robot, still(5.0, height=1.0, **happens)))
+    assert_it_stood_and_tracked(run(ROBOT, still(5.0, height=1.0, **happens)))
 
 
 class Steps(Lockstep):
@@ -86,31 +84,31 @@ class Steps(Lockstep):
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("delay_ms", [3.5, 4.7])
-def test_two_hips_a_bit_late_shake_no_legs(robot: RobotConfig, delay_ms: float) -> None:
+def test_two_hips_a_bit_late_shake_no_legs(delay_ms: float) -> None:
     """At 49 Hz, by 40 N m a cycle, it did from 4.5 s on, unpushed, with all of tau_coupled."""
     late = (*one_late("hip_right", delay_ms), *one_late("hip_left", delay_ms))
     squat = variant("squat", duration=6.0, kill=(), push=(), inject=late)
-    outcome = run(robot, squat, fleet_type=Steps)
+    outcome = run(ROBOT, squat, fleet_type=Steps)
     assert outcome.stood
     assert isinstance(outcome.lockstep, Steps)
     assert outcome.lockstep.largest_nm < 5.0
 
 
-def test_a_drop_out_in_the_middle_of_a_sway_is_not_held_off_centre(robot: RobotConfig) -> None:
+def test_a_drop_out_in_the_middle_of_a_sway_is_not_held_off_centre() -> None:
     """Led from where the sway was, and lost again, HOLD stood 25 mm to the side, and fell."""
     pushes = tuple(push(t, 0.0, 40.0, 0.0) for t in (1.6, 3.1, 4.6))
     lossy = (Inject(link="ankle_left->planner", at=0.3, loss=0.7, burst=5),)
     scenario = led_to((1.0, 1.188), (3.0, 0.948), duration=6.0, push=pushes, inject=lossy)
-    outcome = run(robot, scenario, seed=2038, stands=False)
+    outcome = run(ROBOT, scenario, seed=2038, stands=False)
     assert outcome.stood
     assert np.abs(outcome.com_mm[:, 1]).max() < 55.0
 
 
-def test_without_tau_coupled_sway_is_damped_as_well_as_in_hold(robot: RobotConfig) -> None:
+def test_without_tau_coupled_sway_is_damped_as_well_as_in_hold() -> None:
     cut = (Inject(link="all", at=0.5, partition=True),)
     swings = {}
     for mode, network in {Mode.TRACK: one_late("knee_right", 20.0), Mode.HOLD: cut}.items():
-        result = run(robot, still(4.5, push=(push(1.5, 0.0, 40.0, 0.0),), inject=network))
+        result = run(ROBOT, still(4.5, push=(push(1.5, 0.0, 40.0, 0.0),), inject=network))
         assert result.stood
         assert set(result.modes) == {mode}
         sway = np.abs(result.com_mm[result.t > 1.6, 1])
@@ -137,9 +135,7 @@ def squats(seconds: float) -> tuple[Keyframe, ...]:
         pytest.param(False, 8.0, 0.9, id="datagrams"),
     ],
 )
-def test_20_ms_jitter_and_10_percent_loss(
-    ordered: bool, seconds: float, tracked: float, robot: RobotConfig
-) -> None:
+def test_20_ms_jitter_and_10_percent_loss(ordered: bool, seconds: float, tracked: float) -> None:
     """Before ages were watched and the planner waited, the robot fell in 12 s on streams.
 
     Jitter is about the delay, and none is given: what it would take off is clipped at 0, so half
@@ -157,7 +153,7 @@ def test_20_ms_jitter_and_10_percent_loss(
     def look(fleet: Lockstep, _row: SimTruth) -> None:
         tracking.append(set(modes_of(fleet)) == {Mode.TRACK})
 
-    outcome = run(robot, scenario, each=look)
+    outcome = run(ROBOT, scenario, each=look)
     assert outcome.stood
     assert sum(tracking) > tracked * len(tracking), "it comes back, and does not only HOLD"
     events = outcome.lockstep.events

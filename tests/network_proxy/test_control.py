@@ -18,7 +18,7 @@ from shared.exceptions import FleetError
 from shared.links import COMMANDS
 from shared.network.proxy_protocol import LINE_MAX, SOCKET, Begin, Clear, List, Reply
 from shared.run_directory import live_dir, make_live_dir
-from tests.shared.test_impairment_schedule import Rig as Schedule
+from tests.shared.test_links import Rig as Schedule
 from tools.fleet.proxy_client import ProxyClient
 
 DELAY = Inject(link="planner->joints", at=0.0, delay_ms=30.0)
@@ -147,7 +147,7 @@ def test_the_client_asks_and_is_answered_or_names_how_to_get_a_proxy(
         client.clear("elbow")
 
 
-def test_rubbish_is_answered_with_an_error_and_the_next_request_is_served(
+def test_garbage_and_half_requests_are_answered_or_dropped_and_the_next_is_served(
     served: tuple[Rig, Path],
 ) -> None:
     with dialled(served[1]) as asking:
@@ -157,11 +157,6 @@ def test_rubbish_is_answered_with_an_error_and_the_next_request_is_served(
     assert "not understood" in first.error
     assert second == Reply()
     assert ProxyClient(served[1]).list() == ()
-
-
-def test_who_asks_in_one_piece_too_long_or_leaves_in_the_middle_is_let_go(
-    served: tuple[Rig, Path],
-) -> None:
     for rubbish in (b"x" * (2 * LINE_MAX), b'{"type":'):
         with dialled(served[1]) as asking, contextlib.suppress(OSError):
             asking.sendall(rubbish)
@@ -195,9 +190,7 @@ class Served:
         return asking
 
 
-def test_an_answer_longer_than_a_socket_takes_comes_whole_to_one_who_reads_late(
-    tmp_path: Path,
-) -> None:
+def test_a_client_that_reads_late_never_or_asks_nothing_keeps_no_other_out(tmp_path: Path) -> None:
     served, got = Served(tmp_path), b""
     with served.ask(2 * b'{"type":"list"}\n') as asking:
         with served.ask(b'{"type":"list"}\n') as other:
@@ -207,16 +200,10 @@ def test_an_answer_longer_than_a_socket_takes_comes_whole_to_one_who_reads_late(
             served.turn()
     assert [msgspec.json.decode(line, type=Reply) for line in got.splitlines()] == [LONG, LONG]
     served.control.close()
-
-
-def test_for_one_who_asks_and_never_reads_one_answer_is_kept(tmp_path: Path) -> None:
     served = Served(tmp_path)
     with served.ask(1000 * b'{"type":"list"}\n'):
         assert len(served.control._askers[0].answer) <= len(msgspec.json.encode(LONG)) + 1
         served.control.close()
-
-
-def test_idle_clients_keep_no_other_out(tmp_path: Path) -> None:
     served = Served(tmp_path)
     idle = [served.ask() for _ in range(2 * ASKERS_MAX)]
     assert len(served.control._askers) == ASKERS_MAX

@@ -12,15 +12,11 @@ from hypothesis import strategies as st
 
 from services.joint.differential import motor_from_joint
 from services.planner.law.certificate import DIRECTIONS, UNITS, Certificate, motor_mean
-from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
-from services.planner.law.split import GainSplit
+from services.planner.law.split import GainLaw, GainSplit
 from shared.arrays import Array
-from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
-from tests.planner.conftest import Closed, at_pose, p_at
-from tests.planner.stands import Stand
-from tests.planner.states import with_law
+from tests.planner.states import ROBOT, Stand, at_pose, closed, p_at, with_law
 
 POSES = (
     {"height": 1.188},
@@ -28,31 +24,29 @@ POSES = (
     {"height": 0.85, "pitch": 0.6},
     {"height": 0.80, "pitch": 1.2, "yaw": -0.02},
 )
-
-
 ASSISTS = (0.0, 200.0)
 
 
 @pytest.fixture(
     scope="module", params=product(POSES, ASSISTS), ids=lambda s: f"{s[0]['height']:g}m-{s[1]:g}N"
 )
-def stand(request: pytest.FixtureRequest, robot: RobotConfig, closed: Closed) -> Stand:
+def stand(request: pytest.FixtureRequest) -> Stand:
     pose, assist = request.param
-    return Stand(robot, closed(**pose), assist)
+    return Stand(ROBOT, closed(**pose), assist)
 
 
 @pytest.fixture(scope="module")
-def crouched(robot: RobotConfig, closed: Closed) -> Stand:
-    return Stand(robot, closed(1.0, pitch=0.3, x=0.01), 200.0)
+def crouched() -> Stand:
+    return Stand(ROBOT, closed(1.0, pitch=0.3, x=0.01), 200.0)
 
 
 def random_stiffness(seed: int) -> Array:
     return np.asarray(np.random.default_rng(seed).uniform(0.0, 2000.0, 12), float)
 
 
-def smallest(robot: RobotConfig, K: Array) -> tuple[float, Array]:
+def smallest(K: Array) -> tuple[float, Array]:
     """Return the smallest mu with K p = mu diag(K_required) p, and p (6,)."""
-    values, vectors = np.linalg.eig(K / np.array(robot.certificate.K_required)[:, np.newaxis])
+    values, vectors = np.linalg.eig(K / np.array(ROBOT.certificate.K_required)[:, np.newaxis])
     index = int(values.real.argmin())
     assert abs(values[index].imag) < 1e-6
     return float(values[index].real), np.asarray(vectors[:, index].real, float)
@@ -65,13 +59,13 @@ def test_failsafe_stiffness_is_the_curvature_of_the_energy(stand: Stand) -> None
     np.testing.assert_allclose(got, got.T, rtol=1e-9, atol=1e-6)
 
 
-def test_of_the_scheduled_gains_it_is_exact_to_1_n_per_m(robot: RobotConfig, stand: Stand) -> None:
+def test_of_the_scheduled_gains_it_is_exact_to_1_n_per_m(stand: Stand) -> None:
     """Where the numbers are small and the verdict hangs on them: the smallest eigenvalue."""
-    D = stand.split(GainSplit(robot)).D
+    D = stand.split(GainSplit(ROBOT)).D
     felt = stand.stiffness_felt(D)
     np.testing.assert_allclose(stand.certificate.failsafe_stiffness(D), felt, rtol=1e-3, atol=1.0)
     margins = stand.certificate.margins(D)
-    assert margins.service == pytest.approx(smallest(robot, felt)[0], abs=2e-3)
+    assert margins.service == pytest.approx(smallest(felt)[0], abs=2e-3)
     assert margins.service > 0.5
 
 
@@ -90,21 +84,21 @@ def in_motor_space(D_module: Array, gear_ratio: float) -> Array:
     return np.asarray(motors.T @ np.diag(np.diagonal(at_motors)) @ motors, float)
 
 
-def test_onboard_margin_is_of_motors_alone(robot: RobotConfig, stand: Stand) -> None:
+def test_onboard_margin_is_of_motors_alone(stand: Stand) -> None:
     D = random_stiffness(4)
     D_onboard = np.zeros(12)
     for module in range(6):
         pair = slice(2 * module, 2 * module + 2)
-        K = in_motor_space(D[pair], robot.joint.gear_ratio)
+        K = in_motor_space(D[pair], ROBOT.joint.gear_ratio)
         assert K[0, 1] == pytest.approx(0.0, abs=1e-9)
         D_onboard[pair] = np.diagonal(K)
     np.testing.assert_allclose(motor_mean(D), D_onboard, rtol=1e-12)
-    onboard, _ = smallest(robot, stand.stiffness_felt(D_onboard))
+    onboard, _ = smallest(stand.stiffness_felt(D_onboard))
     assert stand.certificate.margins(D).onboard == pytest.approx(onboard, rel=1e-3, abs=1e-3)
 
 
-def test_where_the_chain_has_no_rates_nothing_is_certified(robot: RobotConfig) -> None:
-    certificate = Certificate(robot)
+def test_where_the_chain_has_no_rates_nothing_is_certified() -> None:
+    certificate = Certificate(ROBOT)
     certificate.at(np.full((12, 6), np.nan), np.zeros((12, 12)))
     margins = certificate.margins(np.full(12, 1e4))
     assert (margins.service, margins.onboard) == (0.0, 0.0)
@@ -118,10 +112,10 @@ def test_a_robot_without_stiffness_falls(stand: Stand) -> None:
     assert stand.certificate.margins(np.zeros(12)).service < -0.3
 
 
-def test_more_assist_leaves_less_margin_in_a_deep_lean(robot: RobotConfig, closed: Closed) -> None:
+def test_more_assist_leaves_less_margin_in_a_deep_lean() -> None:
     q = closed(0.80, pitch=1.2)
     D = np.full(12, 500.0)
-    margins = [Stand(robot, q, assist).certificate.margins(D).onboard for assist in ASSISTS]
+    margins = [Stand(ROBOT, q, assist).certificate.margins(D).onboard for assist in ASSISTS]
     assert margins[1] < margins[0] - 1e-3
 
 
@@ -138,23 +132,23 @@ def test_stiffer_joints_never_lower_a_margin(
     assert after.onboard >= before.onboard - 1e-9
 
 
-def test_all_a_certificate_requires_is_a_margin_of_one(robot: RobotConfig, stand: Stand) -> None:
+def test_all_a_certificate_requires_is_a_margin_of_one(stand: Stand) -> None:
     """Required as much as is there in every direction: 1. Twice as much: a half."""
     K = stand.certificate.failsafe_stiffness(np.full(12, 4000.0))
     least = float(np.linalg.eigvalsh(K)[0])
     for share in (1.0, 2.0):
-        required = msgspec.structs.replace(robot.certificate, K_required=(share * least,) * 6)
-        certificate = Certificate(msgspec.structs.replace(robot, certificate=required))
+        required = msgspec.structs.replace(ROBOT.certificate, K_required=(share * least,) * 6)
+        certificate = Certificate(msgspec.structs.replace(ROBOT, certificate=required))
         certificate.at(stand.T, stand.hessian_O)
         assert certificate.margins(np.full(12, 4000.0)).service == pytest.approx(1.0 / share)
 
 
-def test_weakest_is_an_independent_decompositions(robot: RobotConfig, stand: Stand) -> None:
-    required = np.array(robot.certificate.K_required)
-    for D in (stand.split(GainSplit(robot)).D, *(random_stiffness(seed) for seed in range(6, 12))):
+def test_weakest_is_an_independent_decompositions(stand: Stand) -> None:
+    required = np.array(ROBOT.certificate.K_required)
+    for D in (stand.split(GainSplit(ROBOT)).D, *(random_stiffness(seed) for seed in range(6, 12))):
         weakest = stand.certificate.weakest(D)
         K = stand.certificate.failsafe_stiffness(D)
-        margin, p = smallest(robot, K)
+        margin, p = smallest(K)
         index = int(np.abs(p * np.sqrt(required)).argmax())
         assert weakest.direction == DIRECTIONS[index]
         assert weakest.unit == UNITS[index]
@@ -171,20 +165,18 @@ def test_weakest_is_an_independent_decompositions(robot: RobotConfig, stand: Sta
     [(slice(0, 12, 2), "lean sideways"), (slice(1, 12, 2), "lean forward")],
     ids=["phi", "theta"],
 )
-def test_weakest_names_the_way_a_robot_with_soft_joints_falls(
-    robot: RobotConfig, closed: Closed, soft: slice, direction: str
-) -> None:
+def test_weakest_names_the_way_a_robot_with_soft_joints_falls(soft: slice, direction: str) -> None:
     D = np.full(12, 3000.0)
     D[soft] = 100.0
-    weakest = Stand(robot, closed(1.188), 0.0).certificate.weakest(D)
+    weakest = Stand(ROBOT, closed(1.188), 0.0).certificate.weakest(D)
     assert weakest.direction == direction
     assert weakest.margin < 0.0
 
 
-def test_the_worst_pose_falls_unless_it_is_stiff(robot: RobotConfig, ik: InverseKinematics) -> None:
+def test_the_worst_pose_falls_unless_it_is_stiff(ik: InverseKinematics) -> None:
     """The sign changes with the ankles: 0.948 m, ankle theta from limp to stiff."""
-    q = at_pose(robot, ik, p_at(robot, 0.948), np.array(stand_pose(robot, 1.188)))
-    certificate = Stand(robot, q, 0.0).certificate
+    q = at_pose(ROBOT, ik, p_at(ROBOT, 0.948), np.array(stand_pose(ROBOT, 1.188)))
+    certificate = Stand(ROBOT, q, 0.0).certificate
     D = np.full(12, 500.0)
     verdicts = []
     for ankle in (0.0, 1000.0):
@@ -193,8 +185,8 @@ def test_the_worst_pose_falls_unless_it_is_stiff(robot: RobotConfig, ik: Inverse
     assert verdicts[0] < 0.0 < verdicts[1]
 
 
-def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for(robot: RobotConfig) -> None:
-    certificate, rng = Certificate(robot), np.random.default_rng(3)
+def test_a_stiffness_that_was_returned_stays_when_another_is_asked_for() -> None:
+    certificate, rng = Certificate(ROBOT), np.random.default_rng(3)
     certificate.at(rng.normal(size=(12, 6)), np.zeros((12, 12)))
     soft, stiff = rng.uniform(100.0, 200.0, 12), rng.uniform(1000.0, 2000.0, 12)
     found = certificate.failsafe_stiffness(soft)
@@ -217,11 +209,11 @@ def damped_null_space(J: Array, damping: float) -> Array:
 
 @pytest.mark.parametrize("open_K_p", [0.0, 2000.0])
 def test_gains_are_symmetric_and_the_papers_sum_without_the_open_directions(
-    robot: RobotConfig, stand: Stand, open_K_p: float
+    stand: Stand, open_K_p: float
 ) -> None:
     """So T^T K_q T + K_geo = S_perp K_p + K_0 T^T N T: the paper's law holds with its own gains."""
-    K_p = tuple(open_K_p if i in OPEN else k for i, k in enumerate(robot.law.K_p))
-    changed, J, T = with_law(robot, K_p=K_p), stand.kinematics.J, stand.T
+    K_p = tuple(open_K_p if i in OPEN else k for i, k in enumerate(ROBOT.law.K_p))
+    changed, J, T = with_law(ROBOT, K_p=K_p), stand.kinematics.J, stand.T
     law, gains = changed.law, GainLaw(changed).gains(stand.kinematics, stand.hessian_O)
     closed = 1.0 - np.array(law.S)
     N = damped_null_space(J, law.damping_lambda)

@@ -11,21 +11,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.controller import Action, Observation
-from services.planner.controller_file import absolute, controller_maker, split_spec
+from services.planner.controller import Action, Observation, absolute, controller_maker, split_spec
 from services.planner.intents import OperatorRequest
-from services.planner.law.hocca import Hocca
+from services.planner.law.hocca import Hocca, LawInputs, LawState
 from services.planner.law.split import LocalGains
-from services.planner.watch.controller_guard import SUPPORT, ControllerGuard
+from services.planner.watch.controller_guard import SUPPORT, ControllerGuard, GuardState
 from shared.bus.messages import SplitSource
 from shared.config.files import load
-from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.places import DEFAULT_CONFIG
 from shared.robot.frames import capture_point
 from shared.robot.robot_model import stand_pose
 from shared.state import copied
-from tests.planner.states import with_law
+from tests.planner.states import ROBOT, Kept, with_law
 
 GOOD = """
 class Controller:
@@ -47,11 +45,11 @@ def mine(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["", ":Controller", ":other"])
-def test_each_planner_gets_one_of_its_own(mine: Path, robot: RobotConfig, name: str) -> None:
+def test_each_planner_gets_one_of_its_own(mine: Path, name: str) -> None:
     mine.write_text(GOOD, encoding="utf-8")
-    make = controller_maker(f"{mine}{name}", robot)
+    make = controller_maker(f"{mine}{name}", ROBOT)
     assert make() is not make()
-    assert make().name == robot.name  # type: ignore[attr-defined]  # of the file
+    assert make().name == ROBOT.name  # type: ignore[attr-defined]  # of the file
 
 
 @pytest.mark.parametrize(
@@ -68,20 +66,20 @@ def test_each_planner_gets_one_of_its_own(mine: Path, robot: RobotConfig, name: 
     ],
 )  # fmt: skip
 def test_a_file_that_cannot_be_used_is_one_clear_line(
-    mine: Path, robot: RobotConfig, text: str, name: str, said: str
+    mine: Path, text: str, name: str, said: str
 ) -> None:
     mine.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
-        controller_maker(f"{mine}{name}", robot)
+        controller_maker(f"{mine}{name}", ROBOT)
     assert said in str(caught.value)
     assert "mine.py" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("spec", ["absent.py", "absent", "absent.txt", ""])
-def test_a_file_that_is_not_there_is_one_clear_line(spec: str, robot: RobotConfig) -> None:
+def test_a_file_that_is_not_there_is_one_clear_line(spec: str) -> None:
     with pytest.raises(ConfigError, match=r"FILE\.py or FILE\.py:NAME"):
-        controller_maker(spec, robot)
+        controller_maker(spec, ROBOT)
 
 
 def test_a_spec_is_file_and_name() -> None:
@@ -91,34 +89,34 @@ def test_a_spec_is_file_and_name() -> None:
     assert absolute("b.py:LQR") == f"{Path.cwd() / 'b.py'}:LQR"
 
 
-def test_the_one_that_was_looked_at_is_the_first_planners(mine: Path, robot: RobotConfig) -> None:
+def test_the_one_that_was_looked_at_is_the_first_planners(mine: Path) -> None:
     """It may have opened a device, which a second one could not."""
     mine.write_text(GOOD.replace("def __init__", "all = []\n    def __init__"), encoding="utf-8")
-    make = controller_maker(str(mine), robot)
+    make = controller_maker(str(mine), ROBOT)
     first = make()
     assert type(first).made == 1  # type: ignore[attr-defined]  # of the file
     make()
     assert type(first).made == 2  # type: ignore[attr-defined]
 
 
-def test_a_file_beside_it_can_be_imported(mine: Path, robot: RobotConfig) -> None:
+def test_a_file_beside_it_can_be_imported(mine: Path) -> None:
     (mine.parent / "beside_my_controller.py").write_text("GAIN = 3", encoding="utf-8")
     mine.write_text(f"import beside_my_controller\n{GOOD}", encoding="utf-8")
-    controller_maker(str(mine), robot)
+    controller_maker(str(mine), ROBOT)
 
 
 GEOMETRY = load(DEFAULT_CONFIG).geometry
 
 
 @pytest.fixture(scope="module")
-def hocca(robot: RobotConfig) -> Hocca:
-    return Hocca(robot)
+def hocca() -> Hocca:
+    return Hocca(ROBOT)
 
 
 @pytest.fixture(scope="module")
-def seen(robot: RobotConfig, hocca: Hocca) -> Observation:
-    q, v = np.array(stand_pose(robot, 1.1)), np.zeros(12)
-    law = hocca.tick(q, v, 0.0, 0.004)
+def seen(hocca: Hocca) -> Observation:
+    q, v = np.array(stand_pose(ROBOT, 1.1)), np.zeros(12)
+    law = hocca.tick(LawState(), LawInputs(q, v, 0.004))
     J, T = hocca.measured.J.copy(), hocca.reference.T.copy()
     return Observation(
         0.0, 0.004, q, v, v, law.p, law.pdot, J, T, None, OperatorRequest(), law,
@@ -152,7 +150,9 @@ def scaled(scale: float) -> Callable[[Observation], Action]:
 
 
 def test_what_is_the_shipped_laws_stays_it_to_the_last_bit(hocca: Hocca, seen: Observation) -> None:
-    found = ControllerGuard(Scripted(changed()), hocca, GEOMETRY).act(seen, leads=True)
+    found = Kept(ControllerGuard(Scripted(changed()), hocca, GEOMETRY), GuardState()).act(
+        seen, leads=True
+    )
     for mine, shipped in zip(Action.of(found), Action.of(seen.law), strict=True):
         assert np.array_equal(mine, shipped)
     assert found.local.margins == seen.law.local.margins
@@ -162,7 +162,7 @@ def test_what_is_the_shipped_laws_stays_it_to_the_last_bit(hocca: Hocca, seen: O
 
 def test_unless_it_leads_the_shipped_law_counts(hocca: Hocca, seen: Observation) -> None:
     mine = Scripted(changed(tau_coupled=np.ones(12)))
-    guard = ControllerGuard(mine, hocca, GEOMETRY)
+    guard = Kept(ControllerGuard(mine, hocca, GEOMETRY), GuardState())
     assert guard.act(seen, leads=False) is seen.law
     assert (mine.resets, mine.steps) == (1, 0)
     for _ in range(3):
@@ -174,7 +174,7 @@ def test_unless_it_leads_the_shipped_law_counts(hocca: Hocca, seen: Observation)
 def test_one_that_leads_at_once_is_reset_first(hocca: Hocca, seen: Observation) -> None:
     """Re-execution begins in the middle of a run."""
     mine = Scripted(changed())
-    ControllerGuard(mine, hocca, GEOMETRY).act(seen, leads=True)
+    Kept(ControllerGuard(mine, hocca, GEOMETRY), GuardState()).act(seen, leads=True)
     assert (mine.resets, mine.steps) == (1, 1)
 
 
@@ -183,8 +183,6 @@ def raises(_seen: Observation) -> Action:
 
 
 NAN = np.full(12, math.nan)
-
-
 BAD = {
     "None": lambda _: None,
     "a tuple": lambda seen: tuple(Action.of(seen.law)),
@@ -203,7 +201,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_no_action_holds_all(hocca: Hocca, seen: Observation, name: str) -> None:
     mine = Scripted(BAD[name])
-    guard = ControllerGuard(mine, hocca, GEOMETRY)
+    guard = Kept(ControllerGuard(mine, hocca, GEOMETRY), GuardState())
     for _ in range(3):
         found = guard.act(seen, leads=True)
         assert found.local.source is SplitSource.UNCERTIFIED
@@ -216,7 +214,7 @@ def test_what_is_no_action_holds_all(hocca: Hocca, seen: Observation, name: str)
 @pytest.mark.parametrize("scale", [0.0, 0.3, 0.6, -1.0, 1e3])
 def test_gains_that_fall_are_never_sent(hocca: Hocca, seen: Observation, scale: float) -> None:
     soft = Scripted(scaled(scale))
-    guard = ControllerGuard(soft, hocca, GEOMETRY)
+    guard = Kept(ControllerGuard(soft, hocca, GEOMETRY), GuardState())
     found = guard.act(seen, leads=True)
     assert found.local.source is SplitSource.UNCERTIFIED
     assert np.array_equal(found.local.D, seen.law.local.D)
@@ -231,15 +229,15 @@ def test_gains_that_fall_are_never_sent(hocca: Hocca, seen: Observation, scale: 
 @pytest.mark.parametrize("scale", [1.0, 1.1])
 def test_stiffer_gains_that_stand_are_sent(hocca: Hocca, seen: Observation, scale: float) -> None:
     stiff = Scripted(scaled(scale))
-    found = ControllerGuard(stiff, hocca, GEOMETRY).act(seen, leads=True)
+    found = Kept(ControllerGuard(stiff, hocca, GEOMETRY), GuardState()).act(seen, leads=True)
     assert found.local.source is SplitSource.CONTROLLER
     assert np.array_equal(found.local.D, scale * seen.law.local.D)
     assert found.local.margins.service >= seen.law.local.margins.service
 
 
-def test_no_own_gains_without_a_schedule(robot: RobotConfig, seen: Observation) -> None:
-    hocca = Hocca(msgspec.structs.replace(with_law(robot, split="diagonal"), gain_schedule=None))
-    hocca.tick(seen.q, seen.v, 0.0, 0.004)
+def test_no_own_gains_without_a_schedule(seen: Observation) -> None:
+    hocca = Hocca(msgspec.structs.replace(with_law(ROBOT, split="diagonal"), gain_schedule=None))
+    hocca.tick(LawState(), LawInputs(seen.q, seen.v, 0.004))
     local: LocalGains = hocca.split.certify(seen.law.local.D)
     assert local.source is SplitSource.UNCERTIFIED
 
@@ -257,7 +255,7 @@ def test_near_the_edge_of_the_soles_it_is_not_followed(
         p, pdot = seen.p.copy(), np.zeros(6)
         p[:2] = 0.0
         (p if part == "p" else pdot)[axis] = sign * fraction * SUPPORT * half / gain
-        guard = ControllerGuard(Scripted(changed()), hocca, GEOMETRY)
+        guard = Kept(ControllerGuard(Scripted(changed()), hocca, GEOMETRY), GuardState())
         found = guard.act(seen._replace(p=p, pdot=pdot), leads=True)
         assert (found.local.source is SplitSource.CONTROLLER) is followed, fraction
         assert ("near the edge" in guard.state.why) is not followed
@@ -275,7 +273,7 @@ def test_what_it_sees_cannot_be_written(hocca: Hocca, seen: Observation) -> None
             getattr(shown, part)[...] = 0.0
             return Action.of(shown.law)
 
-        guard = ControllerGuard(Scripted(write), hocca, GEOMETRY)
+        guard = Kept(ControllerGuard(Scripted(write), hocca, GEOMETRY), GuardState())
         before = getattr(seen, part).copy()
         assert guard.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
         assert "read-only" in guard.state.why
@@ -284,7 +282,7 @@ def test_what_it_sees_cannot_be_written(hocca: Hocca, seen: Observation) -> None
 
 def test_each_objection_makes_all_hold_twice_as_long(hocca: Hocca, seen: Observation) -> None:
     soft = Scripted(scaled(0.3))
-    guard = ControllerGuard(soft, hocca, GEOMETRY)
+    guard = Kept(ControllerGuard(soft, hocca, GEOMETRY), GuardState())
     waits = []
     for _ in range(8):
         guard.act(seen, leads=True)
@@ -296,10 +294,10 @@ def test_each_objection_makes_all_hold_twice_as_long(hocca: Hocca, seen: Observa
 
 
 def test_its_state_goes_on_from_a_snapshot(hocca: Hocca, seen: Observation) -> None:
-    failed = ControllerGuard(Scripted(raises), hocca, GEOMETRY)
+    failed = Kept(ControllerGuard(Scripted(raises), hocca, GEOMETRY), GuardState())
     failed.act(seen, leads=True)
     mine = Scripted(changed())
-    again = ControllerGuard(mine, hocca, GEOMETRY)
+    again = Kept(ControllerGuard(mine, hocca, GEOMETRY), GuardState())
     again.state = copied(failed.state)
     assert again.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
     assert again.state.why == failed.state.why
@@ -307,7 +305,7 @@ def test_its_state_goes_on_from_a_snapshot(hocca: Hocca, seen: Observation) -> N
 
 
 def test_after_the_edge_all_hold_until_it_is_calm(hocca: Hocca, seen: Observation) -> None:
-    guard = ControllerGuard(Scripted(changed()), hocca, GEOMETRY)
+    guard = Kept(ControllerGuard(Scripted(changed()), hocca, GEOMETRY), GuardState())
     p = seen.p.copy()
     p[0] = GEOMETRY.l_foot / 2
     away = seen._replace(p=p)
@@ -323,6 +321,6 @@ def test_references_off_the_soles_are_not_sent(hocca: Hocca, seen: Observation) 
     lean = Scripted(
         lambda seen: Action.of(seen.law)._replace(q_ref=seen.law.q_ref + 0.08 * seen.T[:, 0])
     )
-    guard = ControllerGuard(lean, hocca, GEOMETRY)
+    guard = Kept(ControllerGuard(lean, hocca, GEOMETRY), GuardState())
     assert guard.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
     assert guard.state.why.startswith("the rest in HOLD is at ")

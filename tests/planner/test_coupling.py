@@ -9,24 +9,18 @@ from hypothesis import strategies as st
 
 from services.planner.law.coupling import (
     FAST,
-    CoupledTorque,
+    CouplingState,
     PushIntegral,
     UncoupledGains,
+    low_passed,
     pole_gain,
 )
 from services.planner.law.small_matrices import LuDecomposition, eigenvalue_min, positive_part
-from shared.config.robot_config import RobotConfig
-from tests.planner.states import with_law
+from tests.planner.states import DT, ROBOT, with_law
 
 K_P = np.array([2810.0, 2810.0, 0.0, 800.0, 0.0, 400.0])
-
-
 B_P = np.array([300.0, 300.0, 0.0, 60.0, 0.0, 40.0])
-
-
 S = np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
-
-
 CLOSED = np.ix_([0, 1, 3, 5], [0, 1, 3, 5])
 
 
@@ -75,86 +69,68 @@ def test_a_pole_follows_its_bandwidth() -> None:
     assert pole_gain(0.0, 1.0) == 0.0
 
 
-def at_rest(robot: RobotConfig, bandwidth_hz: float) -> CoupledTorque:
-    return CoupledTorque(bandwidth_hz, PushIntegral(robot.law))
+def filtered(s: CouplingState, tau: float, bandwidth_hz: float, dt: float = DT) -> float:
+    return float(low_passed(s, np.full(12, tau), bandwidth_hz, dt)[0])
 
 
-def integral_of(robot: RobotConfig, **law: object) -> PushIntegral:
-    return PushIntegral(with_law(robot, **law).law)
-
-
-def test_a_step_comes_through_two_poles_and_all_of_it(robot: RobotConfig) -> None:
-    filtered, share = at_rest(robot, 4.0), pole_gain(4.0, 0.004)
-    course = [filtered.advance(np.ones(12), 0.004)[0] for _ in range(250)]
+def test_a_step_comes_through_two_poles_and_all_of_it() -> None:
+    s, share = CouplingState(), pole_gain(4.0, DT)
+    course = [filtered(s, 1.0, 4.0) for _ in range(250)]
     assert course[0] == share * share
     assert (np.diff(course) > 0.0).all()
     np.testing.assert_allclose(course[-1], 1.0, atol=1e-6)
 
 
-def test_above_its_bandwidth_it_falls_with_the_square(robot: RobotConfig) -> None:
+def test_above_its_bandwidth_it_falls_with_the_square() -> None:
     gains = []
     for hz in (20.0, 40.0):
-        filtered = at_rest(robot, 2.0)
+        s = CouplingState()
         t = np.arange(2000) * 1e-3
-        out = [filtered.advance(np.full(12, np.sin(2 * np.pi * hz * s)), 1e-3)[0] for s in t]
+        out = [filtered(s, np.sin(2 * np.pi * hz * at), 2.0, 1e-3) for at in t]
         gains.append(np.abs(out[1000:]).max())
     assert 3.5 < gains[0] / gains[1] < 4.5
-
-
-def test_it_forgets_on_reset(robot: RobotConfig) -> None:
-    filtered = at_rest(robot, 3.0)
-    for step in range(20):
-        filtered.advance(np.full(12, float(step)), 0.004)
-        filtered.integral.advance(0.01, 0.0, 0.004)
-    filtered.reset()
-    assert filtered.integral.force == 0.0
-    np.testing.assert_array_equal(filtered.advance(np.zeros(12), 0.004), 0.0)
 
 
 # ---- its integral
 
 
-def test_in_its_time_the_integral_grows_to_what_the_body_s_stiffness_gives(
-    robot: RobotConfig,
-) -> None:
-    integral = integral_of(robot, push_integral_s=2.0)
+def integral_of(**law: object) -> PushIntegral:
+    return PushIntegral(with_law(ROBOT, **law).law)
+
+
+def test_in_its_time_the_integral_grows_to_what_the_body_s_stiffness_gives() -> None:
+    integral, force = integral_of(push_integral_s=2.0), 0.0
     for _ in range(500):
-        integral.advance(0.01, 0.0, 0.004)
-    assert integral.force == pytest.approx(robot.law.K_p[1] * 0.01)
+        force = integral.after(force, 0.01, 0.0, DT)
+    assert force == pytest.approx(ROBOT.law.K_p[1] * 0.01)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_at_its_limit_the_integral_stays_and_comes_back_at_once(
-    robot: RobotConfig, sign: float
-) -> None:
-    integral = integral_of(robot, push_integral_max=40.0)
-    for _ in range(5000):
-        integral.advance(sign, 0.0, 0.004)
-    assert integral.force == sign * 40.0
-    integral.advance(-sign * 1e-3, 0.0, 0.004)
-    assert abs(integral.force) < 40.0
+def test_at_its_limit_the_integral_stays_and_comes_back_at_once(sign: float) -> None:
+    integral = integral_of(push_integral_max=40.0)
+    assert integral.after(39.9 * sign, sign, 0.0, DT) == sign * 40.0
+    assert abs(integral.after(40.0 * sign, -sign * 1e-3, 0.0, DT)) < 40.0
 
 
 @pytest.mark.parametrize(
     ("rate", "share"), [(0.0, 1.0), (0.5, 0.5), (-0.5, 0.5), (1.0, 0.0), (-2.0, 0.0)]
 )
 def test_the_faster_an_error_changes_the_less_of_it_is_integrated(
-    robot: RobotConfig, rate: float, share: float
+    rate: float, share: float
 ) -> None:
-    integral = integral_of(robot, push_integral_s=2.0)
-    integral.advance(0.01, rate * FAST, 0.004)
-    assert integral.force == pytest.approx(share * 0.002 * robot.law.K_p[1] * 0.01)
+    integral = integral_of(push_integral_s=2.0)
+    force = integral.after(0.0, 0.01, rate * FAST, DT)
+    assert force == pytest.approx(share * 0.002 * ROBOT.law.K_p[1] * 0.01)
 
 
 @pytest.mark.parametrize(
     "law", [{"S": (0, 1, 1, 0, 1, 0)}, {"split": "diagonal"}, {"push_integral_max": 0.0}]
 )
 def test_it_integrates_nothing_that_is_led_the_papers_or_without_a_limit(
-    robot: RobotConfig, law: dict[str, object]
+    law: dict[str, object],
 ) -> None:
-    integral = integral_of(robot, **law)
-    integral.advance(0.01, 0.0, 0.004)
-    assert integral.force == integral.most == 0.0
+    integral = integral_of(**law)
+    assert integral.after(0.0, 0.01, 0.0, DT) == integral.most == 0.0
     assert (integral.gain == 0.0) is ("push_integral_max" not in law), "what the certificate takes"
 
 

@@ -10,27 +10,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.joint.drivers.base import DriveStatus
 from services.planner.watch.engagement_fsm import FORGET_NS, GRACE_NS, WAITS_NS, Engagement
-from shared.bus.messages import Mode, PlannerMode
+from shared.bus.messages import DriveStatus, Mode, PlannerMode
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from shared.robot.hold_rules import Dropouts
 from tests.joint.helpers import Bench
+from tests.planner.states import ROBOT
 
 T = TypeVar("T")
-
-
 YES = [True] * 6
-
-
 HOLD = [int(Mode.HOLD)] * 6
-
-
 TRACK = [int(Mode.TRACK)] * 6
-
-
 T0 = 10**12
 
 
@@ -113,8 +104,8 @@ def test_it_goes_on_leading_while_all_six_track() -> None:
 class Fleet:
     """Six controllers and one engagement, without a network in between."""
 
-    def __init__(self, robot: RobotConfig) -> None:
-        self.benches = [Bench(robot, module) for module in MODULES]
+    def __init__(self) -> None:
+        self.benches = [Bench(ROBOT, module) for module in MODULES]
         self.engagement = Engagement()
 
     def run(self, cycles: int) -> list[int]:
@@ -131,8 +122,8 @@ class Fleet:
         return tracking
 
 
-def test_all_six_track_in_one_tick_and_none_beside_a_fault(robot: RobotConfig) -> None:
-    fleet = Fleet(robot)
+def test_all_six_track_in_one_tick_and_none_beside_a_fault() -> None:
+    fleet = Fleet()
     tracking = fleet.run(300)
     assert set(tracking) == {0, 6}
     assert tracking == sorted(tracking)
@@ -142,9 +133,9 @@ def test_all_six_track_in_one_tick_and_none_beside_a_fault(robot: RobotConfig) -
 
 
 @pytest.mark.parametrize("mode", [Mode.FAULT, Mode.DAMP, Mode.DISARMED])
-def test_no_module_tracks_while_one_cannot(robot: RobotConfig, mode: Mode) -> None:
+def test_no_module_tracks_while_one_cannot(mode: Mode) -> None:
     """All six track or none does: no leg is to work against the other."""
-    fleet = Fleet(robot)
+    fleet = Fleet()
     fleet.benches[1].to(mode)
     assert max(fleet.run(1000)) == 0
 

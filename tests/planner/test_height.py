@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.law.height import (
+from services.planner.law.closed_reference import (
     ACCELERATION,
     FADE_RATE,
     FORCE_MAX,
@@ -21,15 +21,16 @@ from services.planner.law.height import (
     RELEASED_S,
     STOPPING,
     HeightReference,
+    HeightState,
     Released,
     Toward,
 )
 from shared.arrays import Array
-from tests.planner.states import DT
+from tests.planner.states import DT, Kept
 
 LED: Released = (False, False)
 DOWN, UP, PERSON = Toward.DOWN, Toward.UP, Toward.PERSON
-T_Z = np.full(12, 4.0)
+T_Z = 4.0
 KNEES = (-2.5, -0.2)
 SLOPE = 0.1
 """m of the COM per rad of the knees."""
@@ -39,7 +40,7 @@ class Body:
     """A body that follows the reference, or that a hand holds where it is."""
 
     def __init__(self, knee: float = -1.0, pitch: float = 0.1, rate: float = 0.0) -> None:
-        self.law = HeightReference(KNEES)
+        self.law = Kept(HeightReference(KNEES), HeightState(T_z=T_Z))
         self.p, self.pdot = np.zeros(6), np.zeros(6)
         self.p[2], self.p[4], self.pdot[2] = 1.0 + SLOPE * knee, pitch, rate
         self.held = False
@@ -53,10 +54,10 @@ class Body:
     ) -> tuple[Array, Array]:
         knees = self.knee, self.knee + 0.02
         self.force, self.moment = self.law.advance(
-            toward, released, drive, self.p, self.pdot, T_Z, knees, DT
+            toward, released, drive, self.p, self.pdot, knees, DT
         )
         p_ref, pdot_ref = self.p.copy(), self.pdot.copy()  # open: the person leads
-        self.law.apply(p_ref, pdot_ref)
+        self.law.state.apply(p_ref, pdot_ref)
         if not self.held:
             self.pdot[2] = (p_ref[2] - self.p[2]) / DT if self.law.state.hold[0] == 1.0 else 0.0
             self.p[2] = p_ref[2]
@@ -115,28 +116,26 @@ def test_given_back_the_person_leads_again() -> None:
 def test_the_planner_not_leading_ends_it_at_once() -> None:
     body = Body()
     body.step(DOWN)
-    body.law.reset()
-    assert not body.law.is_active
+    body.law.state.reset()
+    assert not body.law.state.is_active
 
 
 @pytest.mark.parametrize("T_z", [4.0, 10.0])
 def test_the_reference_hardly_leads_a_robot_that_is_held_and_a_force_makes_up_for_it(
     T_z: float,
 ) -> None:
-    law, p, rest = HeightReference(KNEES), np.zeros(6), (-1.0, -1.0)
+    law, p, rest = Kept(HeightReference(KNEES), HeightState(T_z=T_z)), np.zeros(6), (-1.0, -1.0)
     still = np.zeros(6)
-    forces = [
-        law.advance(UP, LED, 0.0, p, still, np.full(12, T_z), rest, DT)[0] for _ in range(2000)
-    ]
+    forces = [law.advance(UP, LED, 0.0, p, still, rest, DT)[0] for _ in range(2000)]
     assert law.state.height == pytest.approx(min(LEAD_MAX, LEAD_ANGLE / T_z))
     assert max(forces) == FORCE_MAX
     assert max(np.diff(forces)) <= 1.01 * FORCE_RATE * DT
     for _ in range(round(FORCE_MAX / FADE_RATE / DT) - 10):
-        law.advance(PERSON, LED, 0.0, p, still, T_Z, rest, DT)
-    assert law.is_active, "the force fades, and is not dropped"
+        law.advance(PERSON, LED, 0.0, p, still, rest, DT)
+    assert law.state.is_active, "the force fades, and is not dropped"
     for _ in range(20):
-        law.advance(PERSON, LED, 0.0, p, still, T_Z, rest, DT)
-    assert not law.is_active
+        law.advance(PERSON, LED, 0.0, p, still, rest, DT)
+    assert not law.state.is_active
 
 
 def test_going_down_presses_nobody_and_rising_freely_pushes_nobody() -> None:
@@ -185,4 +184,4 @@ def test_a_moment_holds_the_torso_that_nobody_leads_and_fades_under_a_hand(drive
     for _ in range(round(MOMENT_MAX / MOMENT_FADE_RATE / DT) + 30):
         body.step(PERSON)
     assert body.moment == 0.0
-    assert not body.law.is_active
+    assert not body.law.state.is_active

@@ -8,29 +8,26 @@ import numpy as np
 import pytest
 
 from services.planner.law import inverse_kinematics, reference
-from services.planner.law.hocca import Hocca, LawOutput
+from services.planner.law.hocca import LawOutput
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tests.planner.conftest import Closed, at_pose
 from tests.planner.oracle import LEFT, RIGHT
-from tests.planner.states import DT, STILL, with_law
+from tests.planner.states import DT, LIMITS, ROBOT, STILL, Law, at_pose, closed, with_law
 
 OPEN = {"z": 2, "pitch": 4}
-
-
 POSES = ((1.25, 0.0), (1.188, 0.0), (0.948, 0.0), (0.85, 0.6), (0.80, 1.2))
 
 
 @pytest.fixture
-def law(robot: RobotConfig) -> Hocca:
-    return Hocca(robot)
+def law() -> Law:
+    return Law()
 
 
 @pytest.fixture(params=POSES, ids=lambda p: f"{p[0]:g}m-{p[1]:g}rad")
-def q(request: pytest.FixtureRequest, closed: Closed) -> Array:
+def q(request: pytest.FixtureRequest) -> Array:
     """Return a centred pose of the squat or the crawl."""
     height, pitch = request.param
     return closed(height, pitch=pitch)
@@ -45,50 +42,48 @@ def moved(robot: RobotConfig, ik: InverseKinematics, q: Array, index: int, by: f
 
 @pytest.mark.parametrize(("direction", "by"), [("z", -0.01), ("pitch", 0.1)])
 def test_open_directions_are_free(
-    robot: RobotConfig, law: Hocca, ik: InverseKinematics, q: Array, direction: str, by: float
+    law: Law, ik: InverseKinematics, q: Array, direction: str, by: float
 ) -> None:
     """References follow to the tolerance of the IK, and nothing pulls back.
 
     In the tick of a move, tau_ff may be up to `STEP_SURE` rad behind: under 2 N.
     """
-    law.tick(q, STILL, 0.0, DT, align=True)
-    q_moved = moved(robot, ik, q, OPEN[direction], by)
+    law.align(q)
+    q_moved = moved(ROBOT, ik, q, OPEN[direction], by)
     assert np.abs(q_moved - q).max() > 5e-3
-    T = oracle.feasible(robot, q_moved)
-    weight = weight_and_load(robot, q_moved, 0.0)
+    T = oracle.feasible(ROBOT, q_moved)
+    weight = weight_and_load(q_moved, 0.0)
     for force, moment in ((2.0, 0.1), (0.1, 0.01)):
-        output = law.tick(q_moved, STILL, 0.0, DT)
+        output = law.tick(q_moved)
         np.testing.assert_allclose(output.q_ref, q_moved, atol=2e-5)
         pull = T.T @ (torque(output, q_moved) - weight)
         assert abs(pull[2]) < force
         assert abs(pull[4]) < moment
 
 
-def test_coupled_torques_come_slowly_and_ease_at_once(
-    robot: RobotConfig, ik: InverseKinematics, q: Array
-) -> None:
-    law = Hocca(with_law(robot, push_integral_max=0.0))
-    law.tick(q, STILL, 0.0, DT, align=True)
-    q_moved = moved(robot, ik, q, 1, 0.01)
-    first = law.tick(q_moved, STILL, 0.0, DT)
+def test_coupled_torques_come_slowly_and_ease_at_once(ik: InverseKinematics, q: Array) -> None:
+    law = Law(with_law(ROBOT, push_integral_max=0.0))
+    law.align(q)
+    q_moved = moved(ROBOT, ik, q, 1, 0.01)
+    first = law.tick(q_moved)
     assert np.abs(first.tau_unfiltered).max() > 1.0
     assert np.abs(first.tau_coupled).max() < 0.05 * np.abs(first.tau_unfiltered).max()
     for _ in range(250):
-        output = law.tick(q_moved, STILL, 0.0, DT)
+        output = law.tick(q_moved)
     np.testing.assert_allclose(output.tau_coupled, output.tau_unfiltered, atol=0.02)
 
 
-def test_an_error_that_lasts_is_integrated(law: Hocca, closed: Closed) -> None:
+def test_an_error_that_lasts_is_integrated(law: Law) -> None:
     centred, off = closed(1.0), closed(1.0, y=0.005)
-    law.tick(centred, STILL, 0.0, DT, align=True)
-    course = [law.tick(off, STILL, 0.0, DT).tau_coupled for _ in range(500)]
+    law.align(centred)
+    course = [law.tick(off).tau_coupled for _ in range(500)]
     settled, later = (np.abs(course[at]).max() for at in (150, -1))
     assert later > 1.5 * settled
-    held = law.tick(centred, STILL, 0.0, DT, align=True)
+    held = law.align(centred)
     np.testing.assert_allclose(held.tau_coupled, 0.0, atol=0.1)
 
 
-def test_align_makes_no_step_from_any_pose_before(law: Hocca, closed: Closed) -> None:
+def test_align_makes_no_step_from_any_pose_before(law: Law) -> None:
     """Off centre, rolled and yawed: in balance nothing but feedforward acts."""
     off_centre = (
         {"height": 1.0, "x": 0.03, "y": -0.02, "roll": 0.05, "pitch": 0.3, "yaw": -0.04},
@@ -97,53 +92,53 @@ def test_align_makes_no_step_from_any_pose_before(law: Hocca, closed: Closed) ->
     centred = [{"height": height, "pitch": pitch} for height, pitch in POSES]
     for number, pose in enumerate((*centred, *off_centre, *centred)):
         q, scale = closed(**pose), 10.0 if pose in off_centre else 1.0
-        output = law.tick(q, STILL, 0.0, DT, align=number > 0)
+        output = law.tick(q, align=number > 0)
         np.testing.assert_allclose(output.q_ref, q, atol=1e-6 * scale)
         np.testing.assert_allclose(output.v_ref, 0.0, atol=1e-6 * scale)
         np.testing.assert_allclose(output.tau_coupled, 0.0, atol=1e-3 * scale)
         np.testing.assert_allclose(torque(output, q), output.tau_ff, atol=1e-3 * scale)
 
 
-def test_the_reference_glides_to_the_centre(robot: RobotConfig, law: Hocca, closed: Closed) -> None:
+def test_the_reference_glides_to_the_centre(law: Law) -> None:
     q = closed(1.0, x=0.03, y=-0.02, roll=0.05, yaw=-0.04)
-    p = oracle.pose(robot, q)
+    p = oracle.pose(ROBOT, q)
     shut = [0, 1, 3, 5]
-    law.tick(q, STILL, 0.0, DT, align=True)
-    ticks = round(robot.law.recentre_s / DT)
+    law.align(q)
+    ticks = round(ROBOT.law.recentre_s / DT)
     before = p[shut]
     for _ in range(ticks):
-        p_ref = law.tick(q, STILL, 0.0, DT).p_ref
+        p_ref = law.tick(q).p_ref
         step = np.abs(p_ref[shut] - before)
-        assert np.all(step <= 2.0 * np.abs(p[shut]) * DT / robot.law.recentre_s)  # min-jerk peak
+        assert np.all(step <= 2.0 * np.abs(p[shut]) * DT / ROBOT.law.recentre_s)  # min-jerk peak
         assert np.all(np.abs(p_ref[shut]) <= np.abs(before) + 1e-12)
         before = p_ref[shut]
     np.testing.assert_allclose(before, 0.0, atol=1e-9)
     np.testing.assert_allclose(p_ref[[2, 4]], p[[2, 4]], atol=1e-8)  # where the person leads
 
 
-def test_closed_heights_and_pitches_stay_as_found(robot: RobotConfig, closed: Closed) -> None:
+def test_closed_heights_and_pitches_stay_as_found() -> None:
     """They glided to a COM on the floor once: zero is no stand."""
     K_p = (2810.0, 2810.0, 3000.0, 800.0, 300.0, 400.0)
-    closing = Hocca(with_law(robot, S=(0,) * 6, K_p=K_p, split="diagonal"))
+    closing = Law(with_law(ROBOT, S=(0,) * 6, K_p=K_p, split="diagonal"))
     q = closed(1.0, x=0.02, pitch=0.3)
-    p = oracle.pose(robot, q)
-    closing.tick(q, STILL, 0.0, DT, align=True)
-    for _ in range(2 * round(robot.law.recentre_s / DT)):
-        output = closing.tick(q, STILL, 0.0, DT)
+    p = oracle.pose(ROBOT, q)
+    closing.align(q)
+    for _ in range(2 * round(ROBOT.law.recentre_s / DT)):
+        output = closing.tick(q)
     np.testing.assert_allclose(output.p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
     np.testing.assert_allclose(output.p_ref[[0, 1, 3, 5]], 0.0, atol=1e-9)
-    closing.tick(q, STILL, 0.0, DT, align=True)  # and again, after it has led
-    np.testing.assert_allclose(closing.tick(q, STILL, 0.0, DT).p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
+    closing.align(q)  # and again, after it has led
+    np.testing.assert_allclose(closing.tick(q).p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
 
 
-def test_reference_rates_follow_the_person(robot: RobotConfig, law: Hocca, q: Array) -> None:
+def test_reference_rates_follow_the_person(law: Law, q: Array) -> None:
     """C v_ref = 0 and J v_ref = S J v, p_C resting."""
-    law.tick(q, STILL, 0.0, DT, align=True)
+    law.align(q)
     v = 0.3 * np.random.default_rng(6).normal(size=12)
     output = law.tick(q, v, 0.0, DT)
-    kinematics = Kinematics(robot)
+    kinematics = Kinematics(ROBOT)
     kinematics.update(q)
-    S = np.array(robot.law.S)
+    S = np.array(ROBOT.law.S)
     pdot = kinematics.J @ v
     assert np.abs(S * pdot).max() > 0.05
     np.testing.assert_allclose(kinematics.C @ output.v_ref, 0.0, atol=1e-4)
@@ -151,18 +146,18 @@ def test_reference_rates_follow_the_person(robot: RobotConfig, law: Hocca, q: Ar
 
 
 def test_feedforward_rate_is_the_slope_of_feedforward_along_what_the_robot_can_do(
-    robot: RobotConfig, ik: InverseKinematics, q: Array
+    ik: InverseKinematics, q: Array
 ) -> None:
     """Forces between the legs, which D held leaves out, aside."""
-    T = oracle.feasible(robot, q)
+    T = oracle.feasible(ROBOT, q)
     pdot = np.array([0.0, 0.0, -0.15, 0.0, 0.3, 0.0])
-    law = Hocca(robot)
-    law.tick(q, STILL, 0.0, DT, align=True)
+    law = Law()
+    law.align(q)
     rate = law.tick(q, T @ pdot, 0.0, DT).dtau_ff
 
     def feedforward(seconds: float) -> Array:
-        there = at_pose(robot, ik, oracle.pose(robot, q) + seconds * pdot, q)
-        return Hocca(robot).tick(there, STILL, 0.0, DT).tau_ff
+        there = at_pose(ROBOT, ik, oracle.pose(ROBOT, q) + seconds * pdot, q)
+        return Law().tick(there, STILL, 0.0, DT).tau_ff
 
     slope = (feedforward(1e-3) - feedforward(-1e-3)) / 2e-3
     assert np.abs(T.T @ slope).max() > 100.0
@@ -170,31 +165,29 @@ def test_feedforward_rate_is_the_slope_of_feedforward_along_what_the_robot_can_d
 
 
 def test_the_first_tick_takes_the_assist_over_and_the_next_ramp_while_aligning_too(
-    robot: RobotConfig, law: Hocca, closed: Closed
+    law: Law,
 ) -> None:
-    q, most = closed(1.188), robot.assist.force_max
-    law.tick(q, STILL, 0.0, DT, align=True)
-    ramped = law.tick(q, STILL, most, DT, align=True).assist
-    assert ramped == pytest.approx(robot.assist.rate_max * DT)
-    assert Hocca(robot).tick(q, STILL, 1e4, DT, align=True).assist == most
+    q, most = closed(1.188), ROBOT.assist.force_max
+    law.align(q)
+    ramped = law.align(q, STILL, most, DT).assist
+    assert ramped == pytest.approx(ROBOT.assist.rate_max * DT)
+    assert Law().align(q, STILL, 1e4, DT).assist == most
 
 
-def test_references_come_back_after_a_lift_past_the_knees_soft_stop(
-    robot: RobotConfig, law: Hocca, limits: Array, closed: Closed
-) -> None:
+def test_references_come_back_after_a_lift_past_the_knees_soft_stop(law: Law) -> None:
     """The soft stop yields: lifted to knees of -0.10 rad (its limit: -0.2) and set down again."""
     stand = closed(1.188)
-    beyond = limits + 0.14 * np.array([-1.0, 1.0])  # short of the mechanism's own end, 0.15
-    free = InverseKinematics(Kinematics(robot), beyond)
+    beyond = LIMITS + 0.14 * np.array([-1.0, 1.0])  # short of the mechanism's own end, 0.15
+    free = InverseKinematics(Kinematics(ROBOT), beyond)
     free.q[:] = stand
-    low, high = float(oracle.pose(robot, stand)[2]), 0.92874
-    law.tick(stand, STILL, 0.0, DT, align=True)
+    low, high = float(oracle.pose(ROBOT, stand)[2]), 0.92874
+    law.align(stand)
     furthest = 0.0
     path = [*np.linspace(low, high, 250), *([high] * 250), *np.linspace(high, low, 250)]
     for z in path:
         free.solve(np.array([0.0, 0.0, z, 0.0, 0.0, 0.0]), iterations_max=60)
         q = free.q.copy()
-        output = law.tick(q, STILL, 0.0, DT)
+        output = law.tick(q)
         furthest = max(furthest, float(np.abs(output.q_ref - q).max()))
     assert np.abs(q - stand).max() < 1e-4
     assert furthest < 0.3  # the limit itself is 0.1 rad away
@@ -209,8 +202,6 @@ STANDS = (
     {"height": 0.948},
     {"height": 0.80, "pitch": 1.2},
 )
-
-
 PATHS = (
     *((height, 0.0) for height in np.linspace(1.188, 0.948, 13)),
     *((1.188 - 0.398 * share, 1.2 * share) for share in np.linspace(0.0, 1.0, 13)),
@@ -219,7 +210,7 @@ PATHS = (
 
 
 @pytest.fixture(params=STANDS, ids=lambda p: f"{p['height']:g}m-{p.get('pitch', 0):g}rad")
-def posed(request: pytest.FixtureRequest, closed: Closed) -> Array:
+def posed(request: pytest.FixtureRequest) -> Array:
     return closed(**request.param)
 
 
@@ -230,26 +221,26 @@ def torque(output: LawOutput, q: Array, v: Array = STILL) -> Array:
     return np.asarray(output.tau_ff + output.tau_unfiltered + spring + damper, float)
 
 
-def settled(law: Hocca, q: Array, assist: float) -> LawOutput:
+def settled(law: Law, q: Array, assist: float) -> LawOutput:
     """Return the law's output at rest at a pose, once all of the assist is given."""
     for _ in range(2000):
-        if law.tick(q, STILL, assist, DT, align=True).assist == assist:
-            return law.tick(q, STILL, assist, 0.0, align=True)
+        if law.align(q, STILL, assist, DT).assist == assist:
+            return law.align(q, STILL, assist, 0.0)
     raise AssertionError("the assist never came")
 
 
-def weight_and_load(robot: RobotConfig, q: Array, assist: float) -> Array:
+def weight_and_load(q: Array, assist: float) -> Array:
     """Return the slope (12,) of the potential energy of robot and operator's load, N m."""
 
     def energy(q_near: Array) -> Array:
-        load = assist * oracle.harness(robot, q_near)[2]
-        return np.array(oracle.potential_energy(robot, q_near) + load)
+        load = assist * oracle.harness(ROBOT, q_near)[2]
+        return np.array(oracle.potential_energy(ROBOT, q_near) + load)
 
     return oracle.precise_derivative(energy, q)
 
 
-def feet(robot: RobotConfig, q: Array, tau: Array) -> list[Array]:
-    return [oracle.foot_wrench(robot, side, q, tau) for side in (RIGHT, LEFT)]
+def feet(q: Array, tau: Array) -> list[Array]:
+    return [oracle.foot_wrench(ROBOT, side, q, tau) for side in (RIGHT, LEFT)]
 
 
 def about_origin(wrench: Array, at: Array) -> Array:
@@ -257,81 +248,77 @@ def about_origin(wrench: Array, at: Array) -> Array:
     return np.concatenate([wrench[:3], wrench[3:] + np.cross(at, wrench[:3])])
 
 
-def on_the_feet(robot: RobotConfig, q: Array, tau: Array) -> Array:
+def on_the_feet(q: Array, tau: Array) -> Array:
     """Return the sum (6,) of both feet's wrenches, moment about the world's origin."""
-    ankles = [oracle.leg(robot, side, q).ankle for side in (RIGHT, LEFT)]
-    right, left = feet(robot, q, tau)
+    ankles = [oracle.leg(ROBOT, side, q).ankle for side in (RIGHT, LEFT)]
+    right, left = feet(q, tau)
     return about_origin(right, ankles[0]) + about_origin(left, ankles[1])
 
 
-def to_carry(robot: RobotConfig, q: Array, assist: float) -> Array:
+def to_carry(q: Array, assist: float) -> Array:
     """Return the wrench (6,) that weight and operator's load ask of the floor."""
-    weight = np.array([0.0, 0.0, oracle.masses(robot)[1] * oracle.GRAVITY, 0.0, 0.0, 0.0])
+    weight = np.array([0.0, 0.0, oracle.masses(ROBOT)[1] * oracle.GRAVITY, 0.0, 0.0, 0.0])
     lift = np.array([0.0, 0.0, assist, 0.0, 0.0, 0.0])
-    r_com, r_harness = oracle.pose(robot, q)[:3], oracle.harness(robot, q)
+    r_com, r_harness = oracle.pose(ROBOT, q)[:3], oracle.harness(ROBOT, q)
     return about_origin(weight, r_com) + about_origin(lift, r_harness)
 
 
 @pytest.mark.parametrize("assist", [0.0, 200.0])
 def test_feedforward_is_exact_at_rest_and_the_feet_carry_weight_and_assist(
-    robot: RobotConfig, posed: Array, assist: float
+    posed: Array, assist: float
 ) -> None:
     """T^T tau_ff = d(energy)/dp to 1e-9 N and N m, at the pose that the law itself takes.
 
     All six parts of the feet's sum, about the world's origin.
     """
-    output = settled(Hocca(robot), posed, assist)
+    output = settled(Law(), posed, assist)
     np.testing.assert_allclose(output.q_ref, posed, atol=1e-6)
-    T = oracle.feasible(robot, posed)
-    held, wanted = T.T @ output.tau_ff, T.T @ weight_and_load(robot, posed, assist)
+    T = oracle.feasible(ROBOT, posed)
+    held, wanted = T.T @ output.tau_ff, T.T @ weight_and_load(posed, assist)
     assert wanted[2] > 74.0 * oracle.GRAVITY + assist
     np.testing.assert_allclose(held, wanted, atol=1e-9)
-    got = on_the_feet(robot, posed, torque(output, posed))
-    np.testing.assert_allclose(got, to_carry(robot, posed, assist), atol=1e-5)
+    got = on_the_feet(posed, torque(output, posed))
+    np.testing.assert_allclose(got, to_carry(posed, assist), atol=1e-5)
 
 
-def test_pushed_by_the_operator_the_feet_carry_the_push_too(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed
-) -> None:
+def test_pushed_by_the_operator_the_feet_carry_the_push_too(ik: InverseKinematics) -> None:
     """Leant on until 2 mm off centre: sum of the feet = weight + assist + operator.
 
     The operator pushes on the torso with what K_fail and K_c answer along p.
     """
     assist, moved = 150.0, np.array([0.002, -0.002, 0.0, 0.002, 0.0, 0.002])
     centre = closed(1.1)
-    law = Hocca(robot)
+    law = Law()
     settled(law, centre, assist)
-    pushed = at_pose(robot, ik, oracle.pose(robot, centre) + moved, centre)
+    pushed = at_pose(ROBOT, ik, oracle.pose(ROBOT, centre) + moved, centre)
     for _ in range(2):  # the second tick's feedforward is that of the moved reference
         output = law.tick(pushed, STILL, assist, 0.0)
-    T = oracle.feasible(robot, pushed)
-    K_fail = law.split.certificate.failsafe_stiffness(output.local.D)
-    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
+    T = oracle.feasible(ROBOT, pushed)
+    K_fail = law.hocca.split.certificate.failsafe_stiffness(output.local.D)
+    K_c, _ = law.hocca._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
     along_p = (K_fail + K_c) @ moved
-    torso_per_p = oracle.leg_jacobian(robot, RIGHT, pushed) @ T[oracle.LEG[RIGHT]]
+    torso_per_p = oracle.leg_jacobian(ROBOT, RIGHT, pushed) @ T[oracle.LEG[RIGHT]]
     operator = np.linalg.solve(torso_per_p.T, along_p)
-    push = about_origin(operator, oracle.leg(robot, RIGHT, pushed).torso)
+    push = about_origin(operator, oracle.leg(ROBOT, RIGHT, pushed).torso)
     assert np.abs(operator[:2]).min() > 3.0
-    got = on_the_feet(robot, pushed, torque(output, pushed)) - to_carry(robot, pushed, assist)
+    got = on_the_feet(pushed, torque(output, pushed)) - to_carry(pushed, assist)
     np.testing.assert_allclose(got, -push, atol=0.02 * np.abs(push).max())
 
 
 @pytest.mark.parametrize("assist", [0.0, 200.0])
-def test_each_centre_of_pressure_stays_inside_its_sole(
-    robot: RobotConfig, law: Hocca, closed: Closed, assist: float
-) -> None:
+def test_each_centre_of_pressure_stays_inside_its_sole(law: Law, assist: float) -> None:
     """Over the whole squat and the whole crawl; and no foot slides."""
-    geometry = robot.geometry
+    geometry = ROBOT.geometry
     for height, pitch in PATHS:
         q = closed(height, pitch=pitch)
-        for wrench in feet(robot, q, torque(settled(law, q, assist), q)):
+        for wrench in feet(q, torque(settled(law, q, assist), q)):
             force = wrench[:3]
             below = np.array([0.0, 0.0, -geometry.foot_height])
             moment = wrench[3:] - np.cross(below, force)
             x, y = -moment[1] / force[2], moment[0] / force[2]
             room = (geometry.l_foot / 2 - abs(x), geometry.w_foot / 2 - abs(y))
             assert min(room) > 0.01, (height, pitch, assist, x, y)
-            assert force[2] > 0.3 * oracle.masses(robot)[1] * oracle.GRAVITY
+            assert force[2] > 0.3 * oracle.masses(ROBOT)[1] * oracle.GRAVITY
             assert np.hypot(force[0], force[1]) < 0.5 * force[2]  # rubber on a poor floor
 
 
@@ -347,7 +334,7 @@ def exact_ik(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "STEP_SURE", 1e-9)
 
 
-def torque_of(law: Hocca) -> Callable[[Array, Array], Array]:
+def torque_of(law: Law) -> Callable[[Array, Array], Array]:
     """Return (q, v) -> total torque (12,) of a tick at standing time, nothing remembered."""
 
     def total(q: Array, v: Array) -> Array:
@@ -357,40 +344,42 @@ def torque_of(law: Hocca) -> Callable[[Array, Array], Array]:
 
 
 @pytest.mark.usefixtures("exact_ik")
-def test_it_feels_like_k_p_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
+def test_it_feels_like_k_p_where_it_balances_or_free(posed: Array) -> None:
     """With the real S, references moving: -dQ/dp = (K_fail + K_c) S_perp, Q all forces."""
-    law = Hocca(robot)
-    law.tick(posed, STILL, 0.0, 0.0, align=True)
-    total, q_of = torque_of(law), oracle.closed_chain(robot, posed)
+    law = Law()
+    law.align(posed, STILL, 0.0, 0.0)
+    total, q_of = torque_of(law), oracle.closed_chain(ROBOT, posed)
 
     def felt(p: Array) -> Array:
         q_near = q_of(p)
-        out_of_balance = total(q_near, STILL) - weight_and_load(robot, q_near, 0.0)
-        return np.asarray(oracle.feasible(robot, q_near).T @ out_of_balance, float)
+        out_of_balance = total(q_near, STILL) - weight_and_load(q_near, 0.0)
+        return np.asarray(oracle.feasible(ROBOT, q_near).T @ out_of_balance, float)
 
-    slope = oracle.derivative(felt, oracle.pose(robot, posed), 1e-4)
-    S_perp = np.diag(1.0 - np.array(robot.law.S))
+    slope = oracle.derivative(felt, oracle.pose(ROBOT, posed), 1e-4)
+    S_perp = np.diag(1.0 - np.array(ROBOT.law.S))
     at_ref = law.tick(posed, STILL, 0.0, 0.0)
-    T, D = oracle.feasible(robot, posed), at_ref.local.D
+    T, D = oracle.feasible(ROBOT, posed), at_ref.local.D
     # T_ref has them at the law's own damping of its inverse
-    K_fail = law.split.certificate.failsafe_stiffness(D)
-    K_c, _ = law._terms._uncoupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
+    K_fail = law.hocca.split.certificate.failsafe_stiffness(D)
+    K_c, _ = law.hocca._terms._uncoupled.at(K_fail, (T.T * at_ref.local.D_B) @ T)
     wanted = (K_fail + K_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=3.0)
     closed = np.flatnonzero(np.diag(S_perp))
-    left = -slope[np.ix_(closed, closed)] - K_p(robot)[np.ix_(closed, closed)]
+    left = -slope[np.ix_(closed, closed)] - K_p(ROBOT)[np.ix_(closed, closed)]
     assert np.linalg.eigvalsh(0.5 * (left + left.T)).min() > -3.0
 
 
 @pytest.mark.usefixtures("exact_ik")
-def test_motion_is_damped_where_it_balances_or_free(robot: RobotConfig, posed: Array) -> None:
-    law = Hocca(robot)
-    law.tick(posed, STILL, 0.0, 0.0, align=True)
-    total, T = torque_of(law), oracle.feasible(robot, posed)
+def test_motion_is_damped_where_it_balances_or_free(posed: Array) -> None:
+    law = Law()
+    law.align(posed, STILL, 0.0, 0.0)
+    total, T = torque_of(law), oracle.feasible(ROBOT, posed)
     slope = oracle.derivative(lambda pdot: T.T @ total(posed, T @ pdot), np.zeros(6), 1e-4)
-    S_perp = np.diag(1.0 - np.array(robot.law.S))
+    S_perp = np.diag(1.0 - np.array(ROBOT.law.S))
     local = law.tick(posed, STILL, 0.0, 0.0).local
     B_local = (T.T * local.D_B) @ T
-    _, B_c = law._terms._uncoupled.at(law.split.certificate.failsafe_stiffness(local.D), B_local)
+    _, B_c = law.hocca._terms._uncoupled.at(
+        law.hocca.split.certificate.failsafe_stiffness(local.D), B_local
+    )
     wanted = (B_local + B_c) @ S_perp
     np.testing.assert_allclose(-slope, wanted, rtol=2e-3, atol=0.5)

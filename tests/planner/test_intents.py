@@ -10,12 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.planner.intents import Intents, OperatorRequest
-from services.planner.law.shift import ROWS, SHIFT_S, ShiftReference
+from services.planner.law.closed_reference import ROWS, SHIFT_S, ShiftReference, ShiftState
 from shared.arrays import Array
 from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
 from shared.clock import NS_PER_MS
-from shared.config.robot_config import RobotConfig
-from tests.planner.states import DT
+from tests.planner.states import DT, ROBOT, Kept
 
 T0 = 5_000_000_000
 
@@ -26,46 +25,46 @@ def intent(
     return OperatorIntent(t_ns=1, seq=1, assist_n=assist_n, shift=shift, source="a test", sit=sit)
 
 
-def late_ns(robot: RobotConfig, share: float) -> int:
+def late_ns(share: float) -> int:
     """Return when so much of the fade is over."""
-    assist = robot.assist
+    assist = ROBOT.assist
     return T0 + round(assist.stale_ms * NS_PER_MS + share * assist.fade_s * 1e9)
 
 
-def test_without_an_intent_nothing_is_requested(robot: RobotConfig) -> None:
-    assert Intents(robot.assist).request(T0) == OperatorRequest(0.0, STRAIGHT, "")
+def test_without_an_intent_nothing_is_requested() -> None:
+    assert Intents(ROBOT.assist).request(T0) == OperatorRequest(0.0, STRAIGHT, "")
 
 
-def test_a_message_is_given_until_it_is_stale(robot: RobotConfig) -> None:
-    intents = Intents(robot.assist)
+def test_a_message_is_given_until_it_is_stale() -> None:
+    intents = Intents(ROBOT.assist)
     intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02), sit=True), T0)
-    for now in (T0, T0 + 1, late_ns(robot, 0.0)):
+    for now in (T0, T0 + 1, late_ns(0.0)):
         assert intents.request(now) == OperatorRequest(
             80.0, (0.01, 0.0, 0.0, -0.02), "a test", sit=True
         )
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0, 1.5, 1000.0])
-def test_then_it_fades_to_nothing_and_stays_there(robot: RobotConfig, share: float) -> None:
+def test_then_it_fades_to_nothing_and_stays_there(share: float) -> None:
     """Sinking ends at once."""
-    intents = Intents(robot.assist)
+    intents = Intents(ROBOT.assist)
     intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02), sit=True), T0)
-    request = intents.request(late_ns(robot, share))
+    request = intents.request(late_ns(share))
     left = max(0.0, 1.0 - share)
     assert request.assist_n == pytest.approx(80.0 * left)
     assert request.shift == pytest.approx((0.01 * left, 0.0, 0.0, -0.02 * left))
     assert (request.source, request.sit) == ("", False)
 
 
-def test_the_fade_is_slower_than_the_assist_may_fall(robot: RobotConfig) -> None:
-    assert robot.assist.force_max / robot.assist.fade_s < robot.assist.rate_max
+def test_the_fade_is_slower_than_the_assist_may_fall() -> None:
+    assert ROBOT.assist.force_max / ROBOT.assist.fade_s < ROBOT.assist.rate_max
 
 
-def test_an_intent_received_again_is_given_again(robot: RobotConfig) -> None:
-    intents = Intents(robot.assist)
+def test_an_intent_received_again_is_given_again() -> None:
+    intents = Intents(ROBOT.assist)
     intents.receive(intent(80.0), T0)
-    intents.receive(intent(60.0), late_ns(robot, 0.9))
-    assert intents.request(late_ns(robot, 0.95)).assist_n == 60.0
+    intents.receive(intent(60.0), late_ns(0.9))
+    assert intents.request(late_ns(0.95)).assist_n == 60.0
 
 
 @pytest.mark.parametrize(
@@ -75,8 +74,8 @@ def test_an_intent_received_again_is_given_again(robot: RobotConfig) -> None:
         *(intent(1.0, (0.0, x, 0.0, 0.0)) for x in (math.nan, math.inf, -math.inf)),
     ],
 )
-def test_an_intent_without_numbers_is_ignored(robot: RobotConfig, bad: OperatorIntent) -> None:
-    intents = Intents(robot.assist)
+def test_an_intent_without_numbers_is_ignored(bad: OperatorIntent) -> None:
+    intents = Intents(ROBOT.assist)
     intents.receive(intent(80.0), T0)
     before = intents.request(T0)
     intents.receive(bad, T0 + 1)
@@ -87,26 +86,24 @@ def test_an_intent_without_numbers_is_ignored(robot: RobotConfig, bad: OperatorI
 # ---- where the closed directions are asked to be
 
 LARGEST = (0.03, 0.04, 0.06, 0.12)
-
-
 asked = st.tuples(*[st.floats(-1e6, 1e6) | st.floats(-0.15, 0.15)] * 4)
 
 
-def now(follower: ShiftReference) -> tuple[Array, Array]:
+def now(follower: Kept) -> tuple[Array, Array]:
     """Return the shift of p and its rate."""
     p, pdot = np.zeros(6), np.zeros(6)
-    follower.add_to(p, pdot)
+    follower.state.add_to(p, pdot)
     return p, pdot
 
 
-def advanced(follower: ShiftReference, wanted: Vector4, dt: float) -> tuple[Array, Array]:
+def advanced(follower: Kept, wanted: Vector4, dt: float) -> tuple[Array, Array]:
     follower.advance(wanted, dt)
     return now(follower)
 
 
 @given(course=st.lists(st.tuples(asked, st.sampled_from([DT, 2 * DT, 0.02])), max_size=60))
 def test_shift_and_rate_stay_within_their_limits(course: list[tuple[Vector4, float]]) -> None:
-    follower, last = ShiftReference(LARGEST), np.zeros(6)
+    follower, last = Kept(ShiftReference(LARGEST), ShiftState()), np.zeros(6)
     for wanted, dt in course:
         shift, rate = advanced(follower, wanted, dt)
         assert np.all(np.abs(shift[list(ROWS)]) <= np.multiply(LARGEST, 1.0 + 1e-9))
@@ -119,7 +116,7 @@ def test_shift_and_rate_stay_within_their_limits(course: list[tuple[Vector4, flo
 @pytest.mark.parametrize("largest", [LARGEST, STRAIGHT], ids=["limits", "none: it stands straight"])
 @given(wanted=asked)
 def test_it_comes_to_what_is_asked_or_as_near_as_it_may(largest: Vector4, wanted: Vector4) -> None:
-    follower = ShiftReference(largest)
+    follower = Kept(ShiftReference(largest), ShiftState())
     for _ in range(1200):
         shift, rate = advanced(follower, wanted, DT)
     np.testing.assert_allclose(
@@ -129,10 +126,10 @@ def test_it_comes_to_what_is_asked_or_as_near_as_it_may(largest: Vector4, wanted
 
 
 def test_it_rests_where_it_is_while_it_is_not_led() -> None:
-    follower = ShiftReference(LARGEST)
+    follower = Kept(ShiftReference(LARGEST), ShiftState())
     for _ in range(100):
         there, _ = advanced(follower, (0.03, 0.0, 0.0, 0.1), DT)
-    follower.rest()
+    follower.state.rest()
     shift, rate = now(follower)
     np.testing.assert_array_equal(shift, there)
     assert not rate.any()

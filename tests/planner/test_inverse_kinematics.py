@@ -11,27 +11,24 @@ import pytest
 from services.planner.law.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
-from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
-from tests.planner.conftest import Closed, com_height, p_at
+from tests.planner.states import LIMITS, ROBOT, closed, com_height, p_at
 
 KNEES = (3, 9)
-
-
 HIGH = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
 """Out of reach: the stand is 0.63 m off."""
 
 
-def true_residual(robot: RobotConfig, q: Array, p_ref: Array) -> float:
+def true_residual(q: Array, p_ref: Array) -> float:
     """Return the largest error in p or in the closure by the oracle, m or rad."""
-    errors = (oracle.pose(robot, q) - p_ref, oracle.closure(robot, q))
+    errors = (oracle.pose(ROBOT, q) - p_ref, oracle.closure(ROBOT, q))
     return float(max(np.abs(error).max() for error in errors))
 
 
-def assert_reached(robot: RobotConfig, ik: InverseKinematics, p_ref: Array, limits: Array) -> None:
-    assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE, p_ref
-    assert_within(ik.q, limits)
+def assert_reached(ik: InverseKinematics, p_ref: Array) -> None:
+    assert true_residual(ik.q, p_ref) <= 2 * TOLERANCE, p_ref
+    assert_within(ik.q)
 
 
 def counted(monkeypatch: pytest.MonkeyPatch, ik: InverseKinematics) -> list[int]:
@@ -46,14 +43,12 @@ def counted(monkeypatch: pytest.MonkeyPatch, ik: InverseKinematics) -> list[int]
     return count
 
 
-def assert_within(q: Array, limits: Array) -> None:
-    assert np.all(q >= limits[:, 0])
-    assert np.all(q <= limits[:, 1])
+def assert_within(q: Array) -> None:
+    assert np.all(q >= LIMITS[:, 0])
+    assert np.all(q <= LIMITS[:, 1])
 
 
-def test_the_stand_converges_to_any_pose_of_the_workspace(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
-) -> None:
+def test_the_stand_converges_to_any_pose_of_the_workspace(ik: InverseKinematics) -> None:
     """Torso 0.85..1.20 m with every offset; nearer the ends a leg cannot reach them all."""
     rng = np.random.default_rng(11)
     stand = closed(1.188)
@@ -62,34 +57,34 @@ def test_the_stand_converges_to_any_pose_of_the_workspace(
         x, y = rng.uniform(-0.06, 0.06, 2)
         roll, yaw = rng.uniform(-0.1, 0.1, 2)
         height, pitch = rng.uniform(0.85, 1.20), rng.uniform(-0.2, 1.2)
-        poses.append(p_at(robot, height, x=x, y=y, roll=roll, pitch=pitch, yaw=yaw))
+        poses.append(p_at(ROBOT, height, x=x, y=y, roll=roll, pitch=pitch, yaw=yaw))
     ends = itertools.product((0.80, 1.25), (0.0, 1.2))
-    for p_ref in (*poses, *(p_at(robot, height, pitch=pitch) for height, pitch in ends)):
+    for p_ref in (*poses, *(p_at(ROBOT, height, pitch=pitch) for height, pitch in ends)):
         ik.q[:] = stand
         assert ik.solve(p_ref, iterations_max=60).converged, p_ref
-        assert_reached(robot, ik, p_ref, limits)
+        assert_reached(ik, p_ref)
         assert ik.q[list(KNEES)].max() <= -0.2  # bent backwards, as the limits have it
         assert np.abs(ik.kinematics.p - p_ref).max() < 2e-3, "left a step before it at most"
 
 
 def test_a_squat_takes_at_most_two_iterations_a_tick_and_as_many_kinematics(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed, monkeypatch: pytest.MonkeyPatch
+    ik: InverseKinematics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Warm, without a search."""
     ik.q[:] = closed(1.188)
     count = counted(monkeypatch, ik)
     for tick in range(1250):  # 5 s at 250 Hz
         phase, before = 2 * math.pi * tick / 1250, count[0]
-        z = com_height(robot, 1.188 - 0.12 * (1 - math.cos(phase)))
+        z = com_height(ROBOT, 1.188 - 0.12 * (1 - math.cos(phase)))
         p_ref = np.array([0.0, 0.0, z, 0.0, 0.1 * math.sin(phase), 0.0])
         result = ik.solve(p_ref)
         assert result.converged
         assert max(result.iterations, count[0] - before) <= 2
-        assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE
+        assert true_residual(ik.q, p_ref) <= 2 * TOLERANCE
 
 
 def test_out_of_reach_a_tick_computes_the_kinematics_three_times(
-    ik: InverseKinematics, closed: Closed, monkeypatch: pytest.MonkeyPatch
+    ik: InverseKinematics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The third takes back a step that led nowhere, once it is at a limit."""
     ik.q[:] = closed(0.948)
@@ -101,44 +96,42 @@ def test_out_of_reach_a_tick_computes_the_kinematics_three_times(
 
 
 def test_an_unreachable_pose_keeps_the_limits_is_reported_and_ends_no_worse_than_it_began(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+    ik: InverseKinematics,
 ) -> None:
     ik.q[:] = closed(1.188)
-    at_start = true_residual(robot, ik.q, HIGH)
+    at_start = true_residual(ik.q, HIGH)
     for _ in range(50):
         assert not ik.solve(HIGH).converged
         assert np.isfinite(ik.q).all()
-        assert_within(ik.q, limits)
-    assert true_residual(robot, ik.q, HIGH) <= at_start
+        assert_within(ik.q)
+    assert true_residual(ik.q, HIGH) <= at_start
 
 
-def test_the_residual_is_true_where_a_limit_stops_the_step(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed
-) -> None:
+def test_the_residual_is_true_where_a_limit_stops_the_step(ik: InverseKinematics) -> None:
     """A pose crept beyond the knee's limit must not be reported as reached."""
     ik.q[:] = closed(1.25)
-    start = float(oracle.pose(robot, ik.q)[2])
+    start = float(oracle.pose(ROBOT, ik.q)[2])
     for z in np.arange(start, 0.9271, 1e-5):
         p_ref = np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])
         result = ik.solve(p_ref)
         if result.converged:
-            assert true_residual(robot, ik.q, p_ref) <= 10 * TOLERANCE, f"z = {z:.5f}: {result}"
+            assert true_residual(ik.q, p_ref) <= 10 * TOLERANCE, f"z = {z:.5f}: {result}"
     assert ik.q[KNEES[0]] == pytest.approx(-0.2, abs=1e-3)  # the limit was met
 
 
-def test_stand_pose_is_level_with_its_com_over_the_ankles(robot: RobotConfig) -> None:
+def test_stand_pose_is_level_with_its_com_over_the_ankles() -> None:
     for height in (0.85, 0.948, 1.188, 1.25):
-        p = oracle.pose(robot, np.array(stand_pose(robot, height)))
+        p = oracle.pose(ROBOT, np.array(stand_pose(ROBOT, height)))
         np.testing.assert_allclose(p[[0, 3, 4, 5]], 0.0, atol=1e-9)
 
 
-def reachable(robot: RobotConfig, limits: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def reachable(rng: np.random.Generator) -> tuple[Array, Array]:
     """Return (q, p) drawn inside the limits and the workspace, by the oracle alone.
 
     The right leg's joints are drawn; the left leg is brought to carry the same torso by
     Newton's method; what leaves the limits or the workspace is drawn again.
     """
-    low, high = limits[:6].T
+    low, high = LIMITS[:6].T
     while True:
         roll, pitch = rng.uniform(-0.2, 0.2), rng.uniform(-0.3, 1.3)
         right = rng.uniform(low, high)
@@ -146,42 +139,40 @@ def reachable(robot: RobotConfig, limits: Array, rng: np.random.Generator) -> tu
         right[4] = roll - right[0] - right[2] + rng.uniform(-0.1, 0.1)
         right[5] = pitch - right[1] - right[3]
         q = np.concatenate([right, right])
-        torso, yaw = oracle.leg(robot, oracle.RIGHT, q).torso, oracle.pose(robot, q)[5]
+        torso, yaw = oracle.leg(ROBOT, oracle.RIGHT, q).torso, oracle.pose(ROBOT, q)[5]
         if not 0.75 <= torso[2] <= 1.25 or abs(torso[0]) > 0.3 or abs(yaw) > 0.3:
             continue
         for _ in range(8):
-            J = oracle.leg_jacobian(robot, oracle.LEFT, q)
-            q[6:] -= np.clip(np.linalg.solve(J, oracle.closure(robot, q)), -0.4, 0.4)
-        p = oracle.pose(robot, q)
-        inside = np.all((q >= limits[:, 0]) & (q <= limits[:, 1]))
+            J = oracle.leg_jacobian(ROBOT, oracle.LEFT, q)
+            q[6:] -= np.clip(np.linalg.solve(J, oracle.closure(ROBOT, q)), -0.4, 0.4)
+        p = oracle.pose(ROBOT, q)
+        inside = np.all((q >= LIMITS[:, 0]) & (q <= LIMITS[:, 1]))
         most = np.array([0.1, 0.1, 2.0, 0.2, 1.3, 0.3])
-        closed = np.abs(oracle.closure(robot, q)).max() < 1e-9
+        closed = np.abs(oracle.closure(ROBOT, q)).max() < 1e-9
         if inside and closed and np.all(np.abs(p) <= most) and p[4] >= -0.3:
             return q, p
 
 
 def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array
+    ik: InverseKinematics,
 ) -> None:
     """None of 7 500 such poses failed, each from a random start and from a stand."""
     rng = np.random.default_rng(2024)
     for _ in range(30):
-        _, p_ref = reachable(robot, limits, rng)
+        _, p_ref = reachable(rng)
         for _ in range(8):
-            ik.q[:] = rng.uniform(limits[:, 0], limits[:, 1])
+            ik.q[:] = rng.uniform(LIMITS[:, 0], LIMITS[:, 1])
             reach = ik.solve_from_anywhere(p_ref)
-            assert reach.converged, describe(reach, p_ref, limits)
-            assert_reached(robot, ik, p_ref, limits)
+            assert reach.converged, describe(reach, p_ref, LIMITS)
+            assert_reached(ik, p_ref)
 
 
-def test_a_pose_beyond_the_fold_is_reached_and_reported_so(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
-) -> None:
+def test_a_pose_beyond_the_fold_is_reached_and_reported_so(ik: InverseKinematics) -> None:
     """Made with a left knee twisted by -0.535 rad; every stand ends 0.35 mm short of it."""
     p_ref = np.array([-0.07247, 0.06702, 0.90433, -0.03099, 0.82851, 0.13846])
     ik.q[:] = closed(1.188)
-    assert describe(ik.solve_from_anywhere(p_ref), p_ref, limits) == "p_ref is reached"
-    assert_reached(robot, ik, p_ref, limits)
+    assert describe(ik.solve_from_anywhere(p_ref), p_ref, LIMITS) == "p_ref is reached"
+    assert_reached(ik, p_ref)
 
 
 UNREACHABLE = {
@@ -201,32 +192,32 @@ def p_unreachable(request: pytest.FixtureRequest) -> Array:
 
 
 def test_out_of_reach_it_ends_inside_the_limits_with_legs_that_agree(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, p_unreachable: Array
+    ik: InverseKinematics, p_unreachable: Array
 ) -> None:
     rng, misses = np.random.default_rng(3), []
-    for start in (rng.uniform(*limits.T), closed(1.188), closed(0.85, pitch=1.0)):
+    for start in (rng.uniform(*LIMITS.T), closed(1.188), closed(0.85, pitch=1.0)):
         ik.q[:] = start
         reach = ik.solve_from_anywhere(p_unreachable)
         assert reach.outcome in (IkEnding.JOINT_LIMIT, IkEnding.OUT_OF_REACH)
         assert np.isfinite(ik.q).all()
-        assert_within(ik.q, limits)
-        assert np.abs(oracle.closure(robot, ik.q)).max() < 1e-5
+        assert_within(ik.q)
+        assert np.abs(oracle.closure(ROBOT, ik.q)).max() < 1e-5
         np.testing.assert_allclose(
-            p_unreachable - oracle.pose(robot, ik.q), reach.error, atol=2 * TOLERANCE
+            p_unreachable - oracle.pose(ROBOT, ik.q), reach.error, atol=2 * TOLERANCE
         )
         misses.append(float(np.linalg.norm(reach.error)))
     assert misses[1] == pytest.approx(misses[2], abs=1e-5)  # any stand ends as near
 
 
 def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, p_unreachable: Array
+    ik: InverseKinematics, p_unreachable: Array
 ) -> None:
     """By the oracle, to first order: moves of 1 mrad that keep the legs together."""
     ik.q[:] = closed(1.188)
     reach = ik.solve_from_anywhere(p_unreachable)
-    C = oracle.derivative(lambda near: oracle.closure(robot, near), ik.q)
-    J = oracle.derivative(lambda near: oracle.pose(robot, near), ik.q)
-    at_limit = (ik.q >= limits[:, 1] - 1e-6) * 1.0 - (ik.q <= limits[:, 0] + 1e-6)
+    C = oracle.derivative(lambda near: oracle.closure(ROBOT, near), ik.q)
+    J = oracle.derivative(lambda near: oracle.pose(ROBOT, near), ik.q)
+    at_limit = (ik.q >= LIMITS[:, 1] - 1e-6) * 1.0 - (ik.q <= LIMITS[:, 0] + 1e-6)
     rng = np.random.default_rng(8)
     for _ in range(200):
         move = rng.normal(size=12) + rng.uniform(0.0, 100.0) * (reach.error @ J)
@@ -239,45 +230,41 @@ def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
         assert nearer <= 2e-6 or np.abs(C @ move).max() > 1e-9
 
 
-def test_out_of_reach_it_gets_no_worse(robot: RobotConfig, ik: InverseKinematics) -> None:
+def test_out_of_reach_it_gets_no_worse(ik: InverseKinematics) -> None:
     """A start near the best pose there is, where all other starts end 8 mm further away."""
     right, left = [0.1676, 0.1146, -0.5614, -0.5274, 0.3547], [0.0495, 0.0588, -0.2621, -0.9647]
     ik.q[:] = np.array([*right, 1.5819, *left, 0.2394, 2.0868])
     p_ref = np.array([-0.03, -0.109, 1.167, -0.154, 1.216, 0.231])
-    at_start = np.linalg.norm(p_ref - oracle.pose(robot, ik.q))
+    at_start = np.linalg.norm(p_ref - oracle.pose(ROBOT, ik.q))
     assert np.linalg.norm(ik.solve_from_anywhere(p_ref).error) <= at_start
 
 
 TOO_HIGH = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
 
 
-def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
-) -> None:
+def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(ik: InverseKinematics) -> None:
     ik.q[:] = closed(1.188)
     reach = ik.solve_from_anywhere(TOO_HIGH)
     assert reach.outcome is IkEnding.JOINT_LIMIT
     assert reach.stopped == (0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0)
-    assert describe(reach, TOO_HIGH, limits) == (
+    assert describe(reach, TOO_HIGH, LIMITS) == (
         "p_ref cannot be reached: COM z 1.31 m wanted, 0.93 m is the closest: "
         "knee_right_theta at its limit -0.2 rad, knee_left_theta at its limit -0.2 rad"
     )
-    wide = limits.copy()
+    wide = LIMITS.copy()
     wide[list(KNEES), 1] = 0.3
-    beyond = InverseKinematics(Kinematics(robot), wide)
-    beyond.q[:] = stand_pose(robot, 1.188)
+    beyond = InverseKinematics(Kinematics(ROBOT), wide)
+    beyond.q[:] = stand_pose(ROBOT, 1.188)
     reach = beyond.solve_from_anywhere(TOO_HIGH)
     assert (reach.outcome, set(reach.stopped)) == (IkEnding.OUT_OF_REACH, {0}), "straight legs"
     assert describe(reach, TOO_HIGH, wide).endswith("reach no further, no joint is at its limit")
 
 
-def test_a_configuration_on_the_way_is_not_called_the_nearest(
-    ik: InverseKinematics, limits: Array, closed: Closed
-) -> None:
+def test_a_configuration_on_the_way_is_not_called_the_nearest(ik: InverseKinematics) -> None:
     ik.q[:] = closed(1.0)
     reach = ik.examine(TOO_HIGH)
     assert reach.outcome is IkEnding.UNFINISHED
-    said = describe(reach, TOO_HIGH, limits)
+    said = describe(reach, TOO_HIGH, LIMITS)
     assert said.startswith("p_ref was not reached: COM z 1.31 m wanted")
     ik.solve_from_anywhere(TOO_HIGH)  # its knees now stand at their limit, and can come off it
     reach = ik.examine(np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]))
@@ -285,7 +272,7 @@ def test_a_configuration_on_the_way_is_not_called_the_nearest(
 
 
 def test_the_same_start_and_pose_give_the_same_bits(
-    ik: InverseKinematics, closed: Closed, p_unreachable: Array
+    ik: InverseKinematics, p_unreachable: Array
 ) -> None:
     ik.q[:] = closed(1.0)
     ik.solve_from_anywhere(p_unreachable)

@@ -15,10 +15,8 @@ from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
-from tests.planner.conftest import SQUAT, Closed
 from tests.planner.oracle import LEFT, RIGHT
-from tests.planner.stands import Stand
-from tests.planner.states import WEIGHT
+from tests.planner.states import ROBOT, SQUAT, WEIGHT, Stand, closed
 from tools.lab.design.push_limit import LoadedStand
 
 POSES = (
@@ -30,7 +28,7 @@ POSES = (
 
 
 @pytest.fixture(params=POSES, ids=lambda p: f"{p['height']:g}m-{p.get('pitch', 0):g}rad")
-def q(request: pytest.FixtureRequest, closed: Closed) -> Array:
+def q(request: pytest.FixtureRequest) -> Array:
     return closed(**request.param)
 
 
@@ -45,30 +43,30 @@ def slope(kinematics: Kinematics, name: str, q: Array, D_left: Array | None = No
 
 
 def test_pose_closure_and_harness_are_the_papers_where_the_legs_agree(
-    robot: RobotConfig, kinematics: Kinematics, q: Array
+    kinematics: Kinematics, q: Array
 ) -> None:
     kinematics.update(q)
     for side in (RIGHT, LEFT):
-        np.testing.assert_allclose(kinematics.p, oracle.pose(robot, q, side), atol=1e-8)
-        np.testing.assert_allclose(kinematics.r_harness, oracle.harness(robot, q, side), atol=1e-8)
-        np.testing.assert_allclose(kinematics.r_torso, oracle.leg(robot, side, q).torso, atol=1e-8)
+        np.testing.assert_allclose(kinematics.p, oracle.pose(ROBOT, q, side), atol=1e-8)
+        np.testing.assert_allclose(kinematics.r_harness, oracle.harness(ROBOT, q, side), atol=1e-8)
+        np.testing.assert_allclose(kinematics.r_torso, oracle.leg(ROBOT, side, q).torso, atol=1e-8)
     np.testing.assert_allclose(kinematics.closure, 0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("opening", [1e-3, 1e-2])
 def test_closure_is_the_legs_disagreement_when_they_are_open(
-    robot: RobotConfig, kinematics: Kinematics, q: Array, opening: float
+    kinematics: Kinematics, q: Array, opening: float
 ) -> None:
     q_open = q + opening * np.random.default_rng(5).normal(size=12)
     kinematics.update(q_open)
     assert np.abs(kinematics.closure).max() > opening / 2
-    np.testing.assert_allclose(kinematics.closure, oracle.closure(robot, q_open), atol=1e-9)
+    np.testing.assert_allclose(kinematics.closure, oracle.closure(ROBOT, q_open), atol=1e-9)
 
 
-def test_an_open_pose_is_in_between(robot: RobotConfig, averaging: Kinematics, q: Array) -> None:
+def test_an_open_pose_is_in_between(averaging: Kinematics, q: Array) -> None:
     q_open = q + 1e-3 * np.random.default_rng(5).normal(size=12)
     averaging.update(q_open)
-    middle = 0.5 * (oracle.pose(robot, q_open, RIGHT) + oracle.pose(robot, q_open, LEFT))
+    middle = 0.5 * (oracle.pose(ROBOT, q_open, RIGHT) + oracle.pose(ROBOT, q_open, LEFT))
     np.testing.assert_allclose(averaging.p, middle, atol=1e-5)
 
 
@@ -88,15 +86,15 @@ def test_jacobians_are_slopes_and_err_by_no_more_than_the_opening_of_the_legs(
     np.testing.assert_allclose(got, slope(kinematics, vector, q_open, held), atol=most)
 
 
-def test_the_legs_shares_sum_to_one(robot: RobotConfig, kinematics: Kinematics, q: Array) -> None:
+def test_the_legs_shares_sum_to_one(kinematics: Kinematics, q: Array) -> None:
     """D_R + D_L = I, D_R by the same formula from the right foot (docs/law.md#load-sharing)."""
     kinematics.update(q)
-    share_x, share_y, l_z = robot.law.load_sharing_moment_arms
-    l_x, l_y = share_x * robot.geometry.l_foot / 2, share_y * robot.geometry.w_foot / 2
+    share_x, share_y, l_z = ROBOT.law.load_sharing_moment_arms
+    l_x, l_y = share_x * ROBOT.geometry.l_foot / 2, share_y * ROBOT.geometry.w_foot / 2
     W = np.diag([1.0, 1.0, 1.0, l_y**2, l_x**2, l_z**2])
     weighted = []
     for side in (RIGHT, LEFT):
-        leg = oracle.leg(robot, side, q)
+        leg = oracle.leg(ROBOT, side, q)
         x, y, z = leg.ankle - leg.torso
         X = np.eye(6)
         X[3:, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
@@ -106,50 +104,48 @@ def test_the_legs_shares_sum_to_one(robot: RobotConfig, kinematics: Kinematics, 
     np.testing.assert_allclose(kinematics.D_left, D_left, atol=1e-7)
 
 
-def ankle_roll_moment(robot: RobotConfig, J_torso_z: Array, side: int, q: Array) -> Array:
+def ankle_roll_moment(J_torso_z: Array, side: int, q: Array) -> Array:
     """Return a foot's wrench when the legs give the torso 1 N upward and weigh nothing."""
-    w = np.linalg.solve(oracle.leg_jacobian(robot, side, q).T, J_torso_z[oracle.LEG[side]])
-    leg = oracle.leg(robot, side, q)
+    w = np.linalg.solve(oracle.leg_jacobian(ROBOT, side, q).T, J_torso_z[oracle.LEG[side]])
+    leg = oracle.leg(ROBOT, side, q)
     return np.concatenate([w[:3], w[3:] + np.cross(leg.torso - leg.ankle, w[:3])])
 
 
-def up_at_torso(robot: RobotConfig, kinematics: Kinematics) -> Array:
+def up_at_torso(kinematics: Kinematics) -> Array:
     """Return the joint torques (12,) that lift the torso's centre by 1 N.
 
     From J's COM rows with the knees' own part taken off again.
     """
-    m_torso, m_total = oracle.masses(robot)
+    m_torso, m_total = oracle.masses(ROBOT)
     q = np.array(kinematics._pose.arguments[0])
-    knees = np.concatenate([oracle.knee_jacobian(robot, s, q)[2] for s in (RIGHT, LEFT)])
-    return np.asarray((m_total * kinematics.J[2] - robot.mass.module * knees) / m_torso, float)
+    knees = np.concatenate([oracle.knee_jacobian(ROBOT, s, q)[2] for s in (RIGHT, LEFT)])
+    return np.asarray((m_total * kinematics.J[2] - ROBOT.mass.module * knees) / m_torso, float)
 
 
 def test_load_sharing_asks_each_foot_for_less_than_its_edge_gives_and_average_for_more(
-    robot: RobotConfig, kinematics: Kinematics, averaging: Kinematics, closed: Closed
+    kinematics: Kinematics, averaging: Kinematics
 ) -> None:
     """Lifted at the torso, and under its own weight."""
-    force = oracle.masses(robot)[1] * oracle.GRAVITY
+    force = oracle.masses(ROBOT)[1] * oracle.GRAVITY
     weight = np.array([0.0, 0.0, force, 0.0, 0.0, 0.0])
     asked, capacity = [], []
     for height in SQUAT:
         q = closed(height)
         for name, model in (("load_sharing", kinematics), ("average", averaging)):
             model.update(q)
-            lift, bears = up_at_torso(robot, model), model.J.T @ weight
+            lift, bears = up_at_torso(model), model.J.T @ weight
             for side in (RIGHT, LEFT):
-                lifted = force * ankle_roll_moment(robot, lift, side, q)
-                for foot in (lifted, oracle.foot_wrench(robot, side, q, bears)):
-                    edge = foot[2] * robot.geometry.w_foot / 2
+                lifted = force * ankle_roll_moment(lift, side, q)
+                for foot in (lifted, oracle.foot_wrench(ROBOT, side, q, bears)):
+                    edge = foot[2] * ROBOT.geometry.w_foot / 2
                     assert (abs(foot[3]) < edge) == (name == "load_sharing")
                 asked.append(abs(lifted[3]))
-                capacity.append(lifted[2] * robot.geometry.w_foot / 2)
+                capacity.append(lifted[2] * ROBOT.geometry.w_foot / 2)
     assert max(asked) == pytest.approx(127, abs=1.0)  # docs/law.md#load-sharing
     assert min(capacity) == pytest.approx(23, abs=0.5)
 
 
 NO_FORCE = np.zeros(3)
-
-
 STEP = 1e-4
 """m and rad; of the second differences."""
 
@@ -186,7 +182,7 @@ LOADS = {
 
 @pytest.mark.parametrize("mixed", ["load_sharing", "average"])
 def test_hessian_is_exact_along_the_closed_chain(
-    robot: RobotConfig, kinematics: Kinematics, averaging: Kinematics, q: Array, mixed: str
+    kinematics: Kinematics, averaging: Kinematics, q: Array, mixed: str
 ) -> None:
     """T^T H T is the curvature by p of F_h . r_harness - tau . q(p), tau = J^T F + J_h^T F_h held.
 
@@ -197,14 +193,14 @@ def test_hessian_is_exact_along_the_closed_chain(
     held = np.array([w.F @ model.J + w.F_harness @ model.J_harness for w in LOADS.values()])
     forces = np.array([w.F_harness for w in LOADS.values()])
     hessians = {name: model.hessian_times(*load).copy() for name, load in LOADS.items()}
-    q_of, p = oracle.closed_chain(robot, q), oracle.pose(robot, q)
+    q_of, p = oracle.closed_chain(ROBOT, q), oracle.pose(ROBOT, q)
 
     def energy(p_near: Array) -> Array:
         q_near = q_of(p_near)
-        return np.asarray(forces @ oracle.harness(robot, q_near) - held @ q_near, float)
+        return np.asarray(forces @ oracle.harness(ROBOT, q_near) - held @ q_near, float)
 
     curvature = oracle.second_derivative(energy, p, STEP)
-    T = oracle.feasible(robot, q)
+    T = oracle.feasible(ROBOT, q)
     for index, (name, hessian) in enumerate(hessians.items()):
         got, want = T.T @ hessian @ T, curvature[index]
         largest = np.abs(want).max()
@@ -254,9 +250,7 @@ def test_hessian_of_a_force_is_the_slopes_symmetric_part(
     np.testing.assert_allclose(hessian, 0.5 * (want + want.T), atol=1e-5)
 
 
-def test_holding_the_shares_changes_internal_torques_only(
-    robot: RobotConfig, kinematics: Kinematics, q: Array
-) -> None:
+def test_holding_the_shares_changes_internal_torques_only(kinematics: Kinematics, q: Array) -> None:
     """The slope with the shares let free differs a lot, but not along what the robot can do."""
 
     def torque(q_near: Array) -> Array:
@@ -265,7 +259,7 @@ def test_holding_the_shares_changes_internal_torques_only(
 
     free = oracle.derivative(torque, q)
     error = free - torque_slope(kinematics, q, WEIGHT)
-    T = oracle.feasible(robot, q)
+    T = oracle.feasible(ROBOT, q)
     assert np.abs(error).max() > 10.0
     np.testing.assert_allclose(T.T @ error @ T, 0.0, atol=1e-3)
 
@@ -276,9 +270,9 @@ PLACE = (0.08, -0.05, 0.15)
 
 
 @pytest.fixture(scope="module")
-def laden(robot: RobotConfig) -> RobotConfig:
+def laden() -> RobotConfig:
     return msgspec.structs.replace(
-        robot, mass=msgspec.structs.replace(robot.mass, payload_com=PLACE)
+        ROBOT, mass=msgspec.structs.replace(ROBOT.mass, payload_com=PLACE)
     )
 
 
@@ -310,16 +304,16 @@ def test_a_payload_beside_is_balanced_and_certified(laden: RobotConfig, laden_q:
 
 
 def test_the_push_limits_knees_weigh_the_same_wherever_the_payload_is(
-    robot: RobotConfig, laden: RobotConfig, laden_q: Array
+    laden: RobotConfig, laden_q: Array
 ) -> None:
     knees = []
-    for config in (robot, laden):
+    for config in (ROBOT, laden):
         kinematics = Kinematics(config)
         kinematics.update(laden_q)
         knees.append(LoadedStand(config, kinematics, np.zeros((12, 6)), np.zeros((12, 12))))
     np.testing.assert_allclose(knees[0]._tau_knees, knees[1]._tau_knees, atol=1e-6)
 
 
-def test_a_centred_payload_leaves_the_schedule(robot: RobotConfig, laden: RobotConfig) -> None:
-    assert "mass.payload_com" not in inputs_of(robot)
+def test_a_centred_payload_leaves_the_schedule(laden: RobotConfig) -> None:
+    assert "mass.payload_com" not in inputs_of(ROBOT)
     assert inputs_of(laden)["mass.payload_com"] == list(PLACE)

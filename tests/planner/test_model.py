@@ -14,6 +14,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, SIDES
 from shared.robot.robot_model import mjcf
 from tests.planner import oracle
+from tests.planner.states import ROBOT
 
 
 def random_q(count: int) -> Array:
@@ -59,16 +60,16 @@ class Rigid:
         return self.data.oMi[next(i for i, n in enumerate(self.model.names) if name in n)]
 
 
-def test_total_mass_is_the_papers_in_both(robot: RobotConfig) -> None:
-    simulated, rigid = Simulated(robot), Rigid(robot)
-    assert oracle.masses(robot)[1] == pytest.approx(74.58)
+def test_total_mass_is_the_papers_in_both() -> None:
+    simulated, rigid = Simulated(ROBOT), Rigid(ROBOT)
+    assert oracle.masses(ROBOT)[1] == pytest.approx(74.58)
     assert simulated.model.body_mass.sum() == pytest.approx(74.58)
     assert pin.computeTotalMass(rigid.model) == pytest.approx(74.58)
     assert simulated.model.body("torso").mass[0] == pytest.approx(39.66)
 
 
-def test_pinocchio_and_mujoco_agree_on_com_feet_and_knees(robot: RobotConfig) -> None:
-    simulated, rigid = Simulated(robot), Rigid(robot)
+def test_pinocchio_and_mujoco_agree_on_com_feet_and_knees() -> None:
+    simulated, rigid = Simulated(ROBOT), Rigid(ROBOT)
     for q in random_q(100):
         simulated.update(q)
         rigid.update(q)
@@ -80,17 +81,17 @@ def test_pinocchio_and_mujoco_agree_on_com_feet_and_knees(robot: RobotConfig) ->
                 np.testing.assert_allclose(here.rotation.ravel(), there.xmat, atol=1e-12)
 
 
-def test_it_is_the_papers_equations_seen_from_each_foot(robot: RobotConfig) -> None:
+def test_it_is_the_papers_equations_seen_from_each_foot() -> None:
     """The centre of mass too, its four modules below the torso where each leg has them."""
-    simulated = Simulated(robot)
+    simulated = Simulated(ROBOT)
     data = simulated.data
-    _, m_total = oracle.masses(robot)
+    _, m_total = oracle.masses(ROBOT)
     for q in random_q(100):
         simulated.update(q)
         weighed = np.zeros(3)  # of the modules below the torso, from its centre, in its axes
         for index, side in enumerate(SIDES):
-            want = oracle.leg(robot, index, q)
-            harness = want.torso + want.R @ np.array(robot.geometry.harness_point)
+            want = oracle.leg(ROBOT, index, q)
+            harness = want.torso + want.R @ np.array(ROBOT.geometry.harness_point)
             for place, expected in (
                 (data.body("torso").xpos, want.torso),
                 (data.body(f"shin_{side}").xpos, want.knee),
@@ -102,14 +103,14 @@ def test_it_is_the_papers_equations_seen_from_each_foot(robot: RobotConfig) -> N
             np.testing.assert_allclose(foot.T, want.R, atol=1e-12)
             weighed += want.R.T @ (want.knee + want.ankle - 2.0 * want.torso)
         from_torso = data.subtree_com[0] - data.body("torso").xpos
-        com = robot.mass.module * weighed / m_total
+        com = ROBOT.mass.module * weighed / m_total
         np.testing.assert_allclose(from_torso, com, atol=1e-12)
 
 
-def test_leg_geometry_is_the_papers_from_the_foot_up(robot: RobotConfig) -> None:
-    right, left = leg_geometry(robot)
+def test_leg_geometry_is_the_papers_from_the_foot_up() -> None:
+    right, left = leg_geometry(ROBOT)
     for index, geometry in enumerate((right, left)):
-        want = oracle.leg(robot, index, np.zeros(12))
+        want = oracle.leg(ROBOT, index, np.zeros(12))
         np.testing.assert_allclose(geometry.r_foot, want.ankle, atol=1e-12)
         np.testing.assert_allclose(geometry.r_knee, want.knee, atol=1e-12)
         np.testing.assert_allclose(geometry.r_torso, want.torso, atol=1e-12)
@@ -117,11 +118,9 @@ def test_leg_geometry_is_the_papers_from_the_foot_up(robot: RobotConfig) -> None
 
 
 @pytest.mark.parametrize("joint", range(len(JOINTS)), ids=JOINTS)
-def test_positive_theta_leans_forward_and_positive_phi_to_the_right(
-    robot: RobotConfig, joint: int
-) -> None:
+def test_positive_theta_leans_forward_and_positive_phi_to_the_right(joint: int) -> None:
     """A point 1 m above the torso's centre, seen from the foot."""
-    simulated, side, q = Simulated(robot), SIDES[joint // 6], np.zeros(12)
+    simulated, side, q = Simulated(ROBOT), SIDES[joint // 6], np.zeros(12)
     heads = []
     for angle in (0.0, 0.1):
         q[joint] = angle
@@ -131,9 +130,9 @@ def test_positive_theta_leans_forward_and_positive_phi_to_the_right(
     assert forward > 0.09 if "theta" in JOINTS[joint] else left < -0.09
 
 
-def test_a_changed_payload_changes_both(robot: RobotConfig) -> None:
-    lighter = msgspec.structs.replace(robot, mass=msgspec.structs.replace(robot.mass, payload=5.0))
-    full, empty = Simulated(robot), Simulated(lighter)
+def test_a_changed_payload_changes_both() -> None:
+    lighter = msgspec.structs.replace(ROBOT, mass=msgspec.structs.replace(ROBOT.mass, payload=5.0))
+    full, empty = Simulated(ROBOT), Simulated(lighter)
     rigid = Rigid(lighter)
     q = random_q(1)[0]
     for one in (full, empty, rigid):

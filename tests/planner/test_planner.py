@@ -14,14 +14,14 @@ from services.planner.watch.engagement_fsm import WAITS_NS
 from shared.arrays import Array
 from shared.bus.messages import Attitude, JointCommand, Mode, PlannerMode, SplitSource
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
 from shared.joints import N_MODULES
 from tests.imu.robots import with_imu
-from tests.planner.conftest import Closed
 from tests.planner.states import (
+    ROBOT,
     SESSION,
     START_NS,
     TICK_NS,
+    closed,
     lead,
     receive_all,
     receive_but,
@@ -76,11 +76,9 @@ def test_all_hold_until_all_are_ready(planner: Planner, q: Array) -> None:
 
 
 @pytest.mark.parametrize("silent", range(N_MODULES))
-def test_all_hold_while_one_is_stale(
-    robot: RobotConfig, planner: Planner, q: Array, silent: int
-) -> None:
+def test_all_hold_while_one_is_stale(planner: Planner, q: Array, silent: int) -> None:
     start = lead(planner, q)
-    stale_ns = round(robot.planner.state_stale_ms * NS_PER_MS)
+    stale_ns = round(ROBOT.planner.state_stale_ms * NS_PER_MS)
     for now in (start + stale_ns, start + stale_ns + 1):
         for module in set(range(N_MODULES)) - {silent}:
             planner.receive_state(module, state(module, q, seq=50), now)
@@ -100,7 +98,7 @@ def test_commands_carry_each_modules_part_of_the_law(planner: Planner, q: Array)
     assert joined(commands, "k_d").min() > 0.0
 
 
-def test_it_leads_again_from_where_it_is(planner: Planner, q: Array, closed: Closed) -> None:
+def test_it_leads_again_from_where_it_is(planner: Planner, q: Array) -> None:
     now = lead(planner, q) + NS_PER_S
     elsewhere = closed(1.0, x=-0.03, y=0.02, roll=0.04, pitch=0.4)
     receive_all(planner, elsewhere, now, seq=90)
@@ -116,9 +114,9 @@ def test_it_leads_again_from_where_it_is(planner: Planner, q: Array, closed: Clo
     )
 
 
-def test_six_new_states_are_due_once(robot: RobotConfig, planner: Planner, q: Array) -> None:
+def test_six_new_states_are_due_once(planner: Planner, q: Array) -> None:
     last = lead(planner, q)
-    half = round(EARLY_FRACTION * NS_PER_S / robot.planner.rate_hz)
+    half = round(EARLY_FRACTION * NS_PER_S / ROBOT.planner.rate_hz)
     receive_all(planner, q, last + 1, seq=50)
     assert not planner.is_due(last + half - 1)
     assert planner.is_due(last + half)
@@ -128,10 +126,10 @@ def test_six_new_states_are_due_once(robot: RobotConfig, planner: Planner, q: Ar
 
 @pytest.mark.parametrize("heard", [0, 5])
 def test_fewer_than_six_are_due_after_a_period_and_a_quarter(
-    robot: RobotConfig, planner: Planner, q: Array, heard: int
+    planner: Planner, q: Array, heard: int
 ) -> None:
     last = lead(planner, q)
-    late = round(LATE_FRACTION * NS_PER_S / robot.planner.rate_hz)
+    late = round(LATE_FRACTION * NS_PER_S / ROBOT.planner.rate_hz)
     for module in range(heard):
         planner.receive_state(module, state(module, q, seq=50), last + 1)
         planner.receive_state(module, state(module, q, seq=51), last + 2)
@@ -145,7 +143,7 @@ def test_fewer_than_six_are_due_after_a_period_and_a_quarter(
     ids=["tick by tick", "after 5 s: one bounded step"],
 )
 def test_assist_rises_by_the_time_between_ticks_and_a_long_gap_is_not_integrated(
-    robot: RobotConfig, planner: Planner, q: Array, ticks: int, gap_ns: int, seconds: float
+    planner: Planner, q: Array, ticks: int, gap_ns: int, seconds: float
 ) -> None:
     now = lead(planner, q)
     planner.receive_request(OperatorRequest(200.0))
@@ -154,7 +152,7 @@ def test_assist_rises_by_the_time_between_ticks_and_a_long_gap_is_not_integrated
         receive_all(planner, q, now, seq=50 + tick)
         planner.tick(now)
     assist = planner.status(now, 0.0).assist_n
-    assert assist == pytest.approx(robot.assist.rate_max * seconds)
+    assert assist == pytest.approx(ROBOT.assist.rate_max * seconds)
 
 
 def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
@@ -172,7 +170,7 @@ def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
     assert status.ik_residual < 1e-6
 
 
-def test_both_margins_are_told(robot: RobotConfig, planner: Planner, q: Array) -> None:
+def test_both_margins_are_told(planner: Planner, q: Array) -> None:
     now = lead(planner, q)
     receive_all(planner, q, now, seq=50)
     commands = planner.tick(now + 4 * NS_PER_MS)
@@ -180,11 +178,11 @@ def test_both_margins_are_told(robot: RobotConfig, planner: Planner, q: Array) -
     assert {command.margin for command in commands} == {status.margin}
     assert {command.margin_onboard for command in commands} == {status.margin_onboard}
     assert status.split == SplitSource.SCHEDULE
-    assert status.margin >= robot.certificate.margin_min
-    assert status.margin_onboard >= robot.certificate.onboard_margin_min
+    assert status.margin >= ROBOT.certificate.margin_min
+    assert status.margin_onboard >= ROBOT.certificate.onboard_margin_min
 
 
-def test_gains_that_fall_hold_at_once(robot: RobotConfig, planner: Planner, q: Array) -> None:
+def test_gains_that_fall_hold_at_once(planner: Planner, q: Array) -> None:
     """The mode follows a tick later; when the gains stand again it waits as after a drop-out."""
     now = lead(planner, q)
     split = planner._law.split
@@ -212,8 +210,8 @@ def test_gains_that_fall_hold_at_once(robot: RobotConfig, planner: Planner, q: A
     ]
 
 
-def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) -> None:
-    planner = Planner(requiring(robot, K_required=(1e5,) * 6), SESSION)
+def test_a_robot_that_nothing_holds_is_never_lead(q: Array) -> None:
+    planner = Planner(requiring(ROBOT, K_required=(1e5,) * 6), SESSION)
     for tick in range(10):
         now = START_NS + tick * 4 * NS_PER_MS
         receive_all(planner, q, now, seq=tick)
@@ -221,7 +219,7 @@ def test_a_robot_that_nothing_holds_is_never_lead(robot: RobotConfig, q: Array) 
     status = planner.status(now, 0.0)
     assert status.mode == PlannerMode.UNCERTIFIED
     assert status.hold
-    assert status.margin < robot.certificate.margin_min
+    assert status.margin < ROBOT.certificate.margin_min
 
 
 def test_a_status_before_any_state_is_finite(planner: Planner) -> None:
@@ -241,10 +239,10 @@ def attitude(roll: float, seq: int, *, valid: bool = True) -> Attitude:
     [(True, 0.0, True), (True, 99.0, True), (True, 101.0, False), (False, 0.0, False)],
 )
 def test_an_attitude_is_heeded_while_it_is_fresh_and_valid(
-    robot: RobotConfig, closed: Closed, valid: bool, late_ms: float, heeded: bool
+    valid: bool, late_ms: float, heeded: bool
 ) -> None:
     q = closed(1.188)
-    planner = Planner(with_imu(robot, stale_ms=100.0), SESSION)
+    planner = Planner(with_imu(ROBOT, stale_ms=100.0), SESSION)
     receive_all(planner, q, START_NS)
     planner.receive_attitude(attitude(0.0, 1), START_NS)
     planner.tick(START_NS)
@@ -259,10 +257,10 @@ def test_an_attitude_is_heeded_while_it_is_fresh_and_valid(
     assert (after.slope != before.slope) is heeded
 
 
-def test_an_old_wrench_eases_nothing(robot: RobotConfig, closed: Closed) -> None:
+def test_an_old_wrench_eases_nothing() -> None:
     """A hand that pulled with 60 N as the harness fell silent would pull for ever."""
     q = closed(1.188)
-    heard, deaf = Planner(robot, SESSION), Planner(robot, SESSION)
+    heard, deaf = Planner(ROBOT, SESSION), Planner(ROBOT, SESSION)
     now_ns = lead(heard, q)
     assert lead(deaf, q) == now_ns
     heard.receive_wrench(wrench(60.0, t_ns=now_ns), now_ns)

@@ -6,15 +6,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from services.planner.law.hocca import Hocca
+from services.planner.law.feet import FOLLOW_S, Stance, StanceState
 from services.planner.law.kinematics import Kinematics, Measured
-from services.planner.law.stance import FOLLOW_S, Stance
 from shared.arrays import Array
-from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tests.planner.conftest import Closed
 from tests.planner.oracle import LEFT, RIGHT
-from tests.planner.states import DT, STILL
+from tests.planner.states import DT, ROBOT, STILL, Kept, Law, closed
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import stand_at
 
@@ -25,22 +22,20 @@ STANCES = (
     (-0.1, 0.12, -0.02, 0.02, -0.03, -0.3),
 )
 """The right foot against the left: ahead, wider and on a step, turned in, and all at once."""
-
-
 LARGEST = (0.12, 0.14, 0.04, 0.06, 0.06, 0.33)
 
 
 class Standing:
     """Both legs by the paper's equations, their feet put into a stance."""
 
-    def __init__(self, robot: RobotConfig, q: Array, stance: Array) -> None:
+    def __init__(self, q: Array, stance: Array) -> None:
         self.feet: list[Array] = []
         self.turns: list[Array] = []
         self.knees: list[Array] = []
         self.torsos: list[Array] = []
         self.rotations: list[Array] = []
         for side, half in ((RIGHT, 0.5), (LEFT, -0.5)):
-            one = oracle.leg(robot, side, q)
+            one = oracle.leg(ROBOT, side, q)
             turn = pin.exp3(half * stance[3:])
             foot = one.ankle + half * stance[:3]
             self.feet.append(foot)
@@ -61,9 +56,9 @@ def stance(request: pytest.FixtureRequest) -> Array:
 
 
 @pytest.fixture
-def standing_there(robot: RobotConfig, closed: Closed, stance: Array) -> tuple[Kinematics, Array]:
+def standing_there(stance: Array) -> tuple[Kinematics, Array]:
     """Return kinematics in a stance, and joint angles with which both legs agree in it."""
-    kinematics, q = Kinematics(robot), closed(1.0, pitch=0.3, yaw=0.04)
+    kinematics, q = Kinematics(ROBOT), closed(1.0, pitch=0.3, yaw=0.04)
     kinematics.stance[:] = stance
     for _ in range(8):
         kinematics.update(q)
@@ -73,20 +68,20 @@ def standing_there(robot: RobotConfig, closed: Closed, stance: Array) -> tuple[K
 
 
 def test_the_stance_found_is_the_one_in_which_the_legs_agree(
-    robot: RobotConfig, standing_there: tuple[Kinematics, Array], stance: Array
+    standing_there: tuple[Kinematics, Array], stance: Array
 ) -> None:
     _, q = standing_there
-    np.testing.assert_allclose(Standing(robot, q, stance).closure, 0.0, atol=1e-6)
-    np.testing.assert_allclose(Measured(robot).stance_at(q), stance, atol=1e-6)
+    np.testing.assert_allclose(Standing(q, stance).closure, 0.0, atol=1e-6)
+    np.testing.assert_allclose(Measured(ROBOT).stance_at(q), stance, atol=1e-6)
 
 
 def test_the_pose_is_the_papers_with_the_feet_where_they_stand(
-    robot: RobotConfig, standing_there: tuple[Kinematics, Array], stance: Array
+    standing_there: tuple[Kinematics, Array], stance: Array
 ) -> None:
     kinematics, q = standing_there
-    there = Standing(robot, q, stance)
-    m_torso, m_total = oracle.masses(robot)
-    weighed = m_torso * there.torsos[RIGHT] + robot.mass.module * sum(there.knees)
+    there = Standing(q, stance)
+    m_torso, m_total = oracle.masses(ROBOT)
+    weighed = m_torso * there.torsos[RIGHT] + ROBOT.mass.module * sum(there.knees)
     # the ankles weigh too: their middle is the world's origin
     np.testing.assert_allclose(sum(there.feet), 0.0, atol=1e-12)
     np.testing.assert_allclose(kinematics.p[:3], weighed / m_total, atol=1e-6)
@@ -108,11 +103,11 @@ def test_jacobians_are_slopes_in_any_stance(
 
 
 def test_each_sole_is_asked_for_little_moment_where_it_stands(
-    robot: RobotConfig, standing_there: tuple[Kinematics, Array], stance: Array
+    standing_there: tuple[Kinematics, Array], stance: Array
 ) -> None:
     """The weight over the middle of the feet: no foot is to bear it on a lever of decimetres."""
     kinematics, q = standing_there
-    there = Standing(robot, q, stance)
+    there = Standing(q, stance)
     weight = np.array([0.0, 0.0, 500.0])
     for side, share in ((RIGHT, np.eye(6) - kinematics.D_left), (LEFT, kinematics.D_left)):
         # a weight over the origin, as a wrench at the torso's origin
@@ -123,42 +118,42 @@ def test_each_sole_is_asked_for_little_moment_where_it_stands(
         assert abs(pitch_moment) < 0.01 * 500.0, "less than a centimetre of lever"
 
 
-def test_feet_astray_make_no_step_at_align(robot: RobotConfig, closed: Closed) -> None:
+def test_feet_astray_make_no_step_at_align() -> None:
     """What the legs disagree by is how the feet stand: it is taken, not fought."""
     q = closed(1.0, pitch=0.3) + 1e-2 * np.random.default_rng(4).normal(size=12)
-    output = Hocca(robot).tick(q, STILL, 0.0, DT, align=True)
-    assert np.abs(oracle.closure(robot, q)).max() > 1e-2
+    output = Law().align(q, STILL, 0.0, DT)
+    assert np.abs(oracle.closure(ROBOT, q)).max() > 1e-2
     np.testing.assert_allclose(output.q_ref, q, atol=1e-5)
     np.testing.assert_allclose(output.closure, 0.0, atol=1e-6)
 
 
-def test_led_it_keeps_the_stance_held_it_follows(robot: RobotConfig, closed: Closed) -> None:
+def test_led_it_keeps_the_stance_held_it_follows() -> None:
     """A joint that gives is not a foot that has moved; one that stays moved is."""
     q = closed(1.0, pitch=0.3)
-    law = Hocca(robot)
-    began = law.tick(q, STILL, 0.0, DT, align=True).stance.copy()
+    law = Law()
+    began = law.align(q).stance
     moved = q.copy()
     moved[[2, 3]] += 0.01
     for _ in range(20):
-        np.testing.assert_array_equal(law.tick(moved, STILL, 0.0, DT).stance, began)
-    there = Measured(robot).stance_at(moved).copy()
-    away = np.abs(there - began).max()
+        np.testing.assert_array_equal(law.tick(moved).stance, began)
+    there = Measured(ROBOT).stance_at(moved).copy()
+    away = np.abs(np.subtract(there, began)).max()
     assert away > 5e-3
     for _ in range(round(0.1 / DT)):
-        taken = law.tick(moved, STILL, 0.0, DT, align=True).stance.copy()
-    assert 0.0 < np.abs(taken - began).max() < 0.1 * away, "a drop-out of 0.1 s"
+        taken = law.align(moved).stance
+    assert 0.0 < np.abs(np.subtract(taken, began)).max() < 0.1 * away, "a drop-out of 0.1 s"
     for _ in range(round(4 * FOLLOW_S / DT)):
-        taken = law.tick(moved, STILL, 0.0, DT, align=True).stance.copy()
+        taken = law.align(moved).stance
     np.testing.assert_allclose(taken, there, atol=0.05 * away)
 
 
-def test_a_foot_ahead_lets_it_bear_a_harder_push_forwards(robot: RobotConfig) -> None:
+def test_a_foot_ahead_lets_it_bear_a_harder_push_forwards() -> None:
     """The foremost toe is farther from the COM; without the stance both read 72 N."""
 
     def limit(ahead: float) -> float:
-        poses = Poses(robot)
+        poses = Poses(ROBOT)
         poses.kinematics.stance[0] = ahead
-        stand = stand_at(robot, poses, 0.9, 0.0)
+        stand = stand_at(ROBOT, poses, 0.9, 0.0)
         assert stand is not None
         return stand.limit_of_body((1.0, 0.0)).force_n
 
@@ -169,56 +164,54 @@ def test_a_foot_ahead_lets_it_bear_a_harder_push_forwards(robot: RobotConfig) ->
 @pytest.mark.parametrize("row", range(6))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_stance_is_taken_up_to_the_limit_and_refused_beyond_it(row: int, sign: float) -> None:
-    held, at_limit = Stance(LARGEST), np.zeros(6)
+    held, at_limit = Kept(Stance(LARGEST), StanceState()), np.zeros(6)
     at_limit[row] = sign * LARGEST[row]
     beyond = at_limit.copy()
     beyond[row] = np.nextafter(at_limit[row], sign)
     for measured, refused in ((at_limit, False), (beyond, True), (0.5 * at_limit, False)):
-        held.take(measured)
-        assert held.refused is refused
-        assert ("law.stance_max" in held.refusal()) is refused
-        np.testing.assert_array_equal(held.taken, at_limit if refused else measured)
+        held.advance(measured)
+        assert bool(held.state.refusal) is refused
+        assert ("law.stance_max" in held.state.refusal) is refused
+        np.testing.assert_array_equal(held.state.taken, at_limit if refused else measured)
 
 
 def test_what_was_refused_for_long_leaves_no_trace_and_a_moved_foot_is_led_once_followed() -> None:
-    held = Stance(LARGEST)
-    held.take(np.zeros(6))
+    held = Kept(Stance(LARGEST), StanceState())
+    held.advance(np.zeros(6))
     for _ in range(1000):
-        held.take(np.full(6, 0.5), 0.01)
-    assert held.refused
-    np.testing.assert_array_equal(held.taken, 0.0)
+        held.advance(np.full(6, 0.5), 0.01)
+    assert held.state.refusal
+    np.testing.assert_array_equal(held.state.taken, 0.0)
     moved = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.2])
-    held.take(moved, 0.01)
-    assert held.refused
-    assert "have moved" in held.refusal()
+    held.advance(moved, 0.01)
+    assert held.state.refusal
+    assert "have moved" in held.state.refusal
     for _ in range(400):
-        held.take(moved, 0.01)
-    assert not held.refused
+        held.advance(moved, 0.01)
+    assert not held.state.refusal
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_angles_that_are_no_numbers_are_refused_and_leave_no_trace(number: float) -> None:
-    held = Stance(LARGEST)
+    held = Kept(Stance(LARGEST), StanceState())
     good = np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.2])
-    held.take(good)
-    held.take(np.full(6, number), 0.1)
-    assert held.refused
-    np.testing.assert_array_equal(held.taken, good)
-    assert "no stance" in held.refusal()
-    held.take(good)
-    assert not held.refused
+    held.advance(good)
+    held.advance(np.full(6, number), 0.1)
+    assert held.state.refusal
+    np.testing.assert_array_equal(held.state.taken, good)
+    assert "no stance" in held.state.refusal
+    held.advance(good)
+    assert not held.state.refusal
 
 
 @pytest.mark.parametrize("joint", range(12))
 @pytest.mark.parametrize("off", [-np.pi, 3.1, 1.8])
-def test_an_encoder_that_is_half_a_turn_off_is_no_stance(
-    robot: RobotConfig, closed: Closed, joint: int, off: float
-) -> None:
+def test_an_encoder_that_is_half_a_turn_off_is_no_stance(joint: int, off: float) -> None:
     q = closed(1.0, pitch=0.3)
     q[joint] += off
-    held = Stance(robot.law.stance_max)
-    held.take(Measured(robot).stance_at(q))
-    assert held.refused
+    held = Kept(Stance(ROBOT.law.stance_max), StanceState())
+    held.advance(Measured(ROBOT).stance_at(q))
+    assert held.state.refusal
 
 
 @pytest.mark.parametrize(
@@ -232,15 +225,15 @@ def test_an_encoder_that_is_half_a_turn_off_is_no_stance(
     ],
 )
 def test_a_refusal_names_which_foot_is_where(row: int, value: float, words: str) -> None:
-    held = Stance(LARGEST)
+    held = Kept(Stance(LARGEST), StanceState())
     measured = np.zeros(6)
     measured[row] = value
-    held.take(measured)
-    assert words in held.refusal()
+    held.advance(measured)
+    assert words in held.state.refusal
 
 
 def test_without_limits_the_feet_are_where_the_robot_file_has_them() -> None:
-    held = Stance((0.0,) * 6)
-    held.take(np.full(6, 0.5))
-    assert not held.refused
-    np.testing.assert_array_equal(held.taken, 0.0)
+    held = Kept(Stance((0.0,) * 6), StanceState())
+    held.advance(np.full(6, 0.5))
+    assert not held.state.refusal
+    np.testing.assert_array_equal(held.state.taken, 0.0)

@@ -12,11 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.planner.state_phases import COMPARED_TICKS, EVERY_TICKS, SOON_TICKS, StatePhases
+from services.planner.state_phases import (
+    COMPARED_TICKS,
+    EVERY_TICKS,
+    SOON_TICKS,
+    PhasesState,
+    StatePhases,
+)
 from shared.bus.messages import JointState
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES
-from tests.planner.states import state
+from tests.planner.states import Kept, state
 
 RATE_HZ, STATE_HZ = 500.0, 250.0
 CYCLE_NS = round(NS_PER_S / RATE_HZ)
@@ -59,11 +65,11 @@ class Modules:
 
 
 @pytest.fixture
-def phases() -> StatePhases:
-    return StatePhases(RATE_HZ, STATE_HZ)
+def phases() -> Kept:
+    return Kept(StatePhases(RATE_HZ, STATE_HZ), PhasesState())
 
 
-def run(phases: StatePhases, modules: Modules, ticks: int, *, heard: bool = True) -> list[float]:
+def run(phases: Kept, modules: Modules, ticks: int, *, heard: bool = True) -> list[float]:
     """Return the spread of the arrivals of each tick, cycles."""
     spreads = []
     for _ in range(ticks):
@@ -83,12 +89,12 @@ def run(phases: StatePhases, modules: Modules, ticks: int, *, heard: bool = True
     n=st.sampled_from([2, 3, 4]),
 )
 def test_after_one_comparison_all_are_close(begin: list[int], counts: list[int], n: int) -> None:
-    phases = StatePhases(RATE_HZ, RATE_HZ / n)
+    phases = Kept(StatePhases(RATE_HZ, RATE_HZ / n), PhasesState())
     spreads = run(phases, Modules(begin, counts, n=n), COMPARED_TICKS + 20)
     assert max(spreads[-10:]) <= 1.0 + 2 * 0.15 + 1e-9
 
 
-def test_jitter_of_a_cycle_moves_no_module_to_and_fro(phases: StatePhases) -> None:
+def test_jitter_of_a_cycle_moves_no_module_to_and_fro(phases: Kept) -> None:
     begin = [module * CYCLE_NS // 10 for module in range(N_MODULES)]
     modules = Modules(begin, jitter_ns=CYCLE_NS)
     seen = set()
@@ -99,7 +105,7 @@ def test_jitter_of_a_cycle_moves_no_module_to_and_fro(phases: StatePhases) -> No
 
 
 def test_drives_whose_clocks_drift_change_phase_once_for_each_cycle_they_drift(
-    phases: StatePhases,
+    phases: Kept,
 ) -> None:
     modules = Modules(ppm=[0, 200, 0, 0, 0, 0])
     changes, last, spreads = 0, 0, []
@@ -111,8 +117,8 @@ def test_drives_whose_clocks_drift_change_phase_once_for_each_cycle_they_drift(
     assert max(spreads) < 0.5 + 0.15 + 200e-6 * 2 * EVERY_TICKS + 0.05
 
 
-def test_one_late_state_moves_nothing(phases: StatePhases) -> None:
-    assert not phases.compares, "before there are six modules"
+def test_one_late_state_moves_nothing(phases: Kept) -> None:
+    assert not phases.compares(), "before there are six modules"
     modules = Modules()
     run(phases, modules, 1)
     states, _ = modules.send_all()
@@ -122,30 +128,28 @@ def test_one_late_state_moves_nothing(phases: StatePhases) -> None:
     assert phases.state.phases == [0] * N_MODULES
 
 
-def test_modules_that_do_not_hear_are_not_told_again_and_again(phases: StatePhases) -> None:
+def test_modules_that_do_not_hear_are_not_told_again_and_again(phases: Kept) -> None:
     run(phases, Modules([0, CYCLE_NS, 0, 0, 0, 0]), 3 * EVERY_TICKS, heard=False)
     assert phases.state.phases == [0, 1, 0, 0, 0, 0]
 
 
-def test_a_new_planner_adopts_the_phases_that_the_last_one_left(phases: StatePhases) -> None:
+def test_a_new_planner_adopts_the_phases_that_the_last_one_left(phases: Kept) -> None:
     modules = Modules([0, CYCLE_NS, 0, 0, 0, 0])
     run(phases, modules, 250)
     left = list(modules.phases)
-    new = StatePhases(RATE_HZ, STATE_HZ)
+    new = Kept(StatePhases(RATE_HZ, STATE_HZ), PhasesState())
     assert max(run(new, modules, 500)) < 0.5
     assert new.state.phases == left == [0, 1, 0, 0, 0, 0]
 
 
 def test_where_every_cycle_sends_a_state_there_is_nothing_to_choose() -> None:
-    phases = StatePhases(RATE_HZ, RATE_HZ)
+    phases = Kept(StatePhases(RATE_HZ, RATE_HZ), PhasesState())
     run(phases, Modules([0, 700_000, 0, 0, 0, 0], [0, 1, 2, 3, 4, 5], n=1), 500)
     assert phases.state.phases == [0] * N_MODULES
 
 
 @pytest.mark.parametrize("silent", [0, 3])
-def test_while_a_module_is_silent_the_others_keep_their_phases(
-    phases: StatePhases, silent: int
-) -> None:
+def test_while_a_module_is_silent_the_others_keep_their_phases(phases: Kept, silent: int) -> None:
     """Compared with what came last from it, long ago, they would all drift through all phases."""
     modules = Modules(ppm=[20, 40, 60, 80, 100, 0])
     run(phases, modules, COMPARED_TICKS)
@@ -154,7 +158,7 @@ def test_while_a_module_is_silent_the_others_keep_their_phases(
     for _ in range(20 * EVERY_TICKS):
         sent = [last if module == silent else modules.send(module) for module in range(N_MODULES)]
         others = [arrival for module, (_, arrival) in enumerate(sent) if module != silent]
-        compared += phases.compares
+        compared += phases.compares()
         phases.advance(*zip(*sent, strict=True), min(others) - 1)
         modules.phases = list(phases.state.phases)
     assert phases.state.phases == [0] * N_MODULES
@@ -162,31 +166,31 @@ def test_while_a_module_is_silent_the_others_keep_their_phases(
     assert rounds - 1 <= compared / COMPARED_TICKS <= rounds, "between the comparisons it rests"
 
 
-def begun_after(phases: StatePhases, modules: Modules, comparisons: int) -> list[int]:
+def begun_after(phases: Kept, modules: Modules, comparisons: int) -> list[int]:
     """Return the ticks from the begin of each comparison to that of the next."""
     begins, ticks, before = [], 0, True
     while len(begins) <= comparisons:
         run(phases, modules, 1)
         ticks += 1
-        if phases.compares and not before:
+        if phases.compares() and not before:
             begins.append(ticks)
-        before = phases.compares
+        before = phases.compares()
     return [later - earlier for earlier, later in pairwise([0, *begins])]
 
 
-def test_what_is_settled_is_compared_ever_more_rarely(phases: StatePhases) -> None:
+def test_what_is_settled_is_compared_ever_more_rarely(phases: Kept) -> None:
     assert begun_after(phases, Modules(), 4) == [512, 1024, 1024, 1024, 1024]
 
 
 @pytest.mark.parametrize("moved", [1, 5])
 def test_after_a_module_was_moved_it_is_compared_again_in_a_second(
-    phases: StatePhases, moved: int
+    phases: Kept, moved: int
 ) -> None:
     begin = [CYCLE_NS * (module == moved) for module in range(N_MODULES)]
     assert begun_after(phases, Modules(begin), 3) == [256, 512, 1024, 1024]
 
 
-def test_after_a_module_was_silent_it_is_compared_again_in_a_second(phases: StatePhases) -> None:
+def test_after_a_module_was_silent_it_is_compared_again_in_a_second(phases: Kept) -> None:
     modules = Modules()
     run(phases, modules, 512 - 1)
     for _ in range(COMPARED_TICKS):  # nothing new in all of the second
@@ -197,14 +201,14 @@ def test_after_a_module_was_silent_it_is_compared_again_in_a_second(phases: Stat
 
 @pytest.mark.parametrize(("behind", "phase"), [(0.6, 0), (-0.6, 0), (0.7, 1), (-0.7, 1)])
 def test_a_module_behind_by_half_a_period_and_a_bit_moves(
-    phases: StatePhases, behind: float, phase: int
+    phases: Kept, behind: float, phase: int
 ) -> None:
     begin = [round(CYCLE_NS * (10.0 + behind * (module == 2))) for module in range(N_MODULES)]
     run(phases, Modules(begin), COMPARED_TICKS)
     assert phases.state.phases == [0, 0, phase, 0, 0, 0]
 
 
-def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered(phases: StatePhases) -> None:
+def test_arrivals_in_all_phases_move_nothing_and_are_not_remembered(phases: Kept) -> None:
     modules = Modules()
     run(phases, modules, 1)
     for tick in range(COMPARED_TICKS):

@@ -14,25 +14,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import TOLERANCE, InverseKinematics
 from services.planner.law.kinematics import Kinematics
-from services.planner.law.split import GainSplit
+from services.planner.law.split import GainLaw, GainSplit
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
-from tests.planner.conftest import Closed
-from tests.planner.states import WEIGHT, with_law
+from tests.planner.states import LIMITS, ROBOT, WEIGHT, closed, with_law
 
 KNEES = [3, 9]
-
-
 OTHERS = [joint for joint in range(12) if joint not in KNEES]
-
-
 ASSIST = np.array([0.0, 0.0, 200.0])
-
-
 STEP = 0.005
 """rad; of the knees along the path."""
 
@@ -68,15 +60,15 @@ def path_of(robot: RobotConfig) -> Path:
 
 
 @pytest.fixture(scope="module")
-def leaning(robot: RobotConfig) -> Path:
-    return path_of(robot)
+def leaning() -> Path:
+    return path_of(ROBOT)
 
 
 @pytest.fixture(scope="module")
-def upright(robot: RobotConfig) -> Path:
+def upright() -> Path:
     """Return the path of a robot whose feet are as wide as its hips."""
-    geometry = msgspec.structs.replace(robot.geometry, w_base=robot.geometry.w_hip)
-    return path_of(msgspec.structs.replace(robot, geometry=geometry))
+    geometry = msgspec.structs.replace(ROBOT.geometry, w_base=ROBOT.geometry.w_hip)
+    return path_of(msgspec.structs.replace(ROBOT, geometry=geometry))
 
 
 @pytest.fixture(params=["leaning", "upright"])
@@ -129,10 +121,10 @@ def test_the_gains_go_through_straight_knees_without_a_jump(path: Path) -> None:
 
 
 @pytest.mark.parametrize("split", ["certified", "diagonal"])
-def test_local_gains_pass_straight_knees_smoothly(leaning: Path, limits: Array, split: str) -> None:
+def test_local_gains_pass_straight_knees_smoothly(leaning: Path, split: str) -> None:
     robot = leaning.robot
     splitting, gain_law = GainSplit(with_law(robot, split=split)), GainLaw(robot)
-    ik = InverseKinematics(Kinematics(robot), limits)
+    ik = InverseKinematics(Kinematics(robot), LIMITS)
     local = []
     for q in leaning.q:
         T = per_p(ik, q)
@@ -152,9 +144,9 @@ def per_p(ik: InverseKinematics, q: Array) -> Array:
     return ik.solve_rates(np.eye(12)[:, :6])
 
 
-def test_rates_never_exceed_the_motion_they_follow(leaning: Path, limits: Array) -> None:
+def test_rates_never_exceed_the_motion_they_follow(leaning: Path) -> None:
     """The robot led through straight knees: v_ref = T S J v."""
-    ik = InverseKinematics(Kinematics(leaning.robot), limits)
+    ik = InverseKinematics(Kinematics(leaning.robot), LIMITS)
     S = np.array(leaning.robot.law.S)
     for before, q, after in zip(leaning.q, leaning.q[1:], leaning.q[2:], strict=False):
         v = (after - before) / (2 * STEP)
@@ -163,9 +155,9 @@ def test_rates_never_exceed_the_motion_they_follow(leaning: Path, limits: Array)
         assert np.linalg.norm(v_ref) <= 1.01 * np.linalg.norm(v)
 
 
-def test_rates_are_bounded_whatever_is_asked(path: Path, limits: Array) -> None:
+def test_rates_are_bounded_whatever_is_asked(path: Path) -> None:
     """By the damping: 1 / (2 * 1e-4) per unit of pdot. Undamped, no number bounds them."""
-    ik = InverseKinematics(Kinematics(path.robot), limits)
+    ik = InverseKinematics(Kinematics(path.robot), LIMITS)
     largest = max(float(np.linalg.norm(per_p(ik, q), 2)) for q in path.q)
     assert largest <= 5000.0
     at_straight = path.q[100]
@@ -183,10 +175,10 @@ def led(z: float) -> Array:
 
 @pytest.mark.parametrize("beyond", [0.001, 0.01, 0.1])
 def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_no_trace(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, beyond: float
+    ik: InverseKinematics, beyond: float
 ) -> None:
     start = closed(1.188)
-    low = float(oracle.pose(robot, start)[2])
+    low = float(oracle.pose(ROBOT, start)[2])
     ik.q[:] = start
     for _ in range(3):
         ik.solve(led(low))
@@ -197,10 +189,10 @@ def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_n
         before = ik.q.copy()
         ik.solve(led(float(z)))
         assert np.isfinite(ik.q).all()
-        assert np.all(ik.q >= limits[:, 0])
-        assert np.all(ik.q <= limits[:, 1])
+        assert np.all(ik.q >= LIMITS[:, 0])
+        assert np.all(ik.q <= LIMITS[:, 1])
         assert np.abs(ik.q - before).max() < 0.01
-        passed.append((ik.q.copy(), oracle.pose(robot, ik.q)))
+        passed.append((ik.q.copy(), oracle.pose(ROBOT, ik.q)))
     assert passed[len(up)][0][KNEES] == pytest.approx(-0.2, abs=1e-12)
     for (q_up, p_up), (q_down, p_down) in zip(passed, passed[::-1], strict=True):
         np.testing.assert_allclose(p_down, p_up, atol=2 * TOLERANCE)
@@ -212,17 +204,17 @@ def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_n
 
 
 def test_with_knees_free_to_straighten_a_height_beyond_is_finite_and_the_least_miss(
-    robot: RobotConfig, limits: Array, closed: Closed, leaning: Path
+    leaning: Path,
 ) -> None:
     """With straight knees only the legs' lean from ankle to hip remains."""
-    wide = limits.copy()
+    wide = LIMITS.copy()
     wide[KNEES, 1] = 0.1
-    ik = InverseKinematics(Kinematics(robot), wide)
+    ik = InverseKinematics(Kinematics(ROBOT), wide)
     ik.q[:] = closed(1.188)
-    straight = float(oracle.pose(robot, leaning.q[100])[2])
+    straight = float(oracle.pose(ROBOT, leaning.q[100])[2])
     for z in np.linspace(0.92, straight + 0.1, 500):
         before = ik.q.copy()
         ik.solve(led(float(z)))
         assert np.isfinite(ik.q).all()
         assert np.abs(ik.q - before).max() <= 0.2 * 4
-    assert oracle.pose(robot, ik.q)[2] == pytest.approx(straight, abs=1e-4)
+    assert oracle.pose(ROBOT, ik.q)[2] == pytest.approx(straight, abs=1e-4)

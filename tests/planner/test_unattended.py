@@ -95,7 +95,7 @@ class Torso:
     def run(self, time_s: float, acceleration: float, hand: Pair = NO_HAND) -> tuple[bool, bool]:
         for _ in range(round(time_s / DT)):
             self.step(acceleration, hand)
-        return self.watch.state.released
+        return self.watch.released
 
 
 @pytest.mark.parametrize("rests_n", [0.0, -25.0, 24.0])
@@ -105,10 +105,10 @@ def test_a_torso_that_turns_by_itself_is_released_early_whatever_rests_on_the_ha
 ) -> None:
     """3.6 rad/s^2 were seen: 0.8 rad within a second."""
     torso = Torso()
-    while not torso.watch.state.released[1]:
+    while not torso.watch.released[1]:
         torso.step(acceleration, (rests_n, 0.0))
         assert abs(torso.pitch - 0.3) <= RUNAWAY[1]
-    assert torso.watch.state.pitch.drive == pytest.approx(acceleration, rel=0.2)
+    assert torso.watch.pitch.drive == pytest.approx(acceleration, rel=0.2)
 
 
 @pytest.mark.parametrize("rate", [-0.5, 0.3])
@@ -126,7 +126,7 @@ def test_without_a_planner_that_leads_nothing_is_open_and_nothing_released() -> 
     torso = Torso()
     assert torso.run(0.15, 3.6) == GONE
     torso.step(0.0, leads=False)
-    assert torso.watch.state.released == LED
+    assert torso.watch.released == LED
 
 
 def test_a_height_that_falls_by_itself_is_released() -> None:
@@ -134,7 +134,7 @@ def test_a_height_that_falls_by_itself_is_released() -> None:
     for tick in range(60):
         rate = -0.7 * DT * tick
         watch.advance(T0 + tick * TICK_NS, HERE, (rate, 0.0), NO_HAND, leads=True)
-    assert watch.state.released == (True, False)
+    assert watch.released == (True, False)
 
 
 def released(hand: Pair = NO_HAND) -> Torso:
@@ -148,9 +148,9 @@ def released(hand: Pair = NO_HAND) -> Torso:
 def test_a_pitch_that_stays_released_closes_the_height_as_well() -> None:
     torso = released()
     torso.run(PROOF_NS / NS_PER_S, 0.0)
-    assert torso.watch.state.released == (True, True)
+    assert torso.watch.released == (True, True)
     torso.run(HAND_BACK_NS / NS_PER_S + 2 * DT, 0.0, (0.0, HAND_BACK[1]))
-    assert torso.watch.state.released == LED, "a hand on the pitch opens both"
+    assert torso.watch.released == LED, "a hand on the pitch opens both"
 
 
 @pytest.mark.parametrize("hand", [(HAND_BACK[0], 0.0), (-HAND_BACK[0], 0.0)])
@@ -173,4 +173,4 @@ def test_a_harness_that_falls_silent_gives_both_back() -> None:
     torso = released()
     torso.run(0.5, 0.0)
     torso.step(0.0, (math.nan, math.nan))
-    assert torso.watch.state.released == LED
+    assert torso.watch.released == LED

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from services.recorder.disk_guard import MIB
-from services.recorder.loop import Recorder, free_bytes_at
+from services.recorder.host_watch import MIB, free_bytes_at
+from services.recorder.loop import Recorder
 from services.recorder.snapshot import SnapshotRing
 from shared.bus import codec, topics
 from shared.bus.messages import JointEvent, Mode

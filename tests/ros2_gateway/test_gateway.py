@@ -1,19 +1,35 @@
-"""When what goes to ROS 2: rates, silence, namespaces."""
+"""When what goes to ROS 2, and what ROS 2 may ask for: rates, silence, limits, a stop."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from itertools import product
+from types import SimpleNamespace
+from typing import Any, cast
 
 import msgspec
 import pytest
 
-from services.ros2_gateway.conversions import Conversions
+from services.ros2_gateway.conversions import Conversions, RosTypes
 from services.ros2_gateway.gateway import STALE_NS, Gateway, topics_of
-from services.ros2_gateway.ros_types import RosTypes
+from services.ros2_gateway.inbound import (
+    GIVE_UP_NS,
+    REPEAT_NS,
+    SOURCE,
+    Inbound,
+    acceptable,
+    inbound_topics,
+)
+from services.ros2_gateway.loop import PERIOD_NS, GatewayLoop
+from services.ros2_gateway.rmw import RosTopic
+from services.ros2_gateway.ros_session import RosLink
 from shared.bus import topics
-from shared.bus.messages import JointState
+from shared.bus.messages import JointState, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO
+from shared.exceptions import FleetError
 from shared.joints import JOINTS
 from shared.robot.robot_urdf import cross_of
 from tests.messages import all_states, planner_status, wrench
@@ -67,12 +83,15 @@ def test_after_a_pause_nothing_is_made_up_for(robot: RobotConfig) -> None:
     assert gateway.due(later, later) == []
 
 
-def test_what_has_no_rate_is_neither_shown_nor_sent(robot: RobotConfig) -> None:
+def test_what_has_no_rate_or_is_not_valid_is_not_sent(robot: RobotConfig) -> None:
     gateway = made(robot, tf_hz=0.0, simulated=False)
     names = {topic.name for topic in gateway.sent_topics}
     assert names == {"/joint_states", "/harness/wrench", "/diagnostics", "/robot_description"}
     feed(gateway, T0)
     assert {outgoing.topic for outgoing in gateway.due(T0, T0)} <= set(gateway.sent_topics)
+    gateway = made(robot)
+    gateway.receive(topics.WRENCH, "", wrench(valid=False), T0)
+    assert KNOWN.wrench not in {outgoing.topic for outgoing in gateway.due(T0, T0)}
 
 
 @pytest.mark.parametrize(("age_ns", "shown"), [(STALE_NS, True), (STALE_NS + 1, False)])
@@ -105,21 +124,168 @@ def test_a_silent_module_ends_the_torso_and_its_own_joints_only_and_none_is_made
     assert "knee_right" in children
 
 
-def test_a_wrench_that_is_not_valid_is_not_sent(robot: RobotConfig) -> None:
-    gateway = made(robot)
-    gateway.receive(topics.WRENCH, "", wrench(valid=False), T0)
-    assert KNOWN.wrench not in {outgoing.topic for outgoing in gateway.due(T0, T0)}
-
-
-def test_a_namespace_is_before_all_but_what_ros_2_has_at_the_root(robot: RobotConfig) -> None:
+def test_the_namespace_precedes_topics_and_the_description_is_kept_for_late_nodes(
+    robot: RobotConfig,
+) -> None:
     gateway = made(robot, namespace="lab/legs")
     assert {topic.name for topic in gateway.sent_topics} == {
         "/lab/legs/joint_states", "/tf", "/lab/legs/harness/wrench", "/diagnostics", "/clock",
         "/lab/legs/robot_description",
     }  # fmt: skip
-
-
-def test_the_description_is_the_urdf_and_is_kept_for_who_comes_later(robot: RobotConfig) -> None:
     topic, payload = made(robot).description()
     assert topic.qos.transient_local
     assert read(topic.type, payload).data.startswith('<robot name="xrl">')
+
+
+DIAGNOSTICS = topics_of("").diagnostics
+
+
+class PlayedSession:
+    failed = 2
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[RosTopic, Any]] = []
+
+    def put(self, topic: RosTopic, payload: bytes, *_: object) -> None:
+        self.sent.append((topic, payload))
+
+
+class PlayedLink:
+    session: PlayedSession | None = None
+
+
+def test_diagnostics_tell_what_the_gateway_has_sent_by_then(robot: RobotConfig) -> None:
+    link, session = PlayedLink(), PlayedSession()
+    gateway = Gateway(robot, Conversions(robot, RosTypes("jazzy")), simulated=True)
+    loop = GatewayLoop(gateway, [], cast("RosLink", link))
+    for cycle in range(350):
+        link.session = session if cycle >= 50 else None  # the router comes later
+        loop.cycle(cycle * PERIOD_NS, NS_PER_S + cycle * PERIOD_NS)
+    assert loop.sent == len(session.sent)
+    told = 0
+    for before, (topic, payload) in enumerate(session.sent):
+        if topic == DIAGNOSTICS:
+            row = read(topic.type, payload).status[-1]
+            values = {pair.key: pair.value for pair in row.values}
+            assert row.name == "xrl: ros2_gateway"
+            # Asked while the cycle's messages are made: the others of that cycle are not sent yet.
+            assert before - len(gateway.sent_topics) < int(values["sent"]) <= before
+            assert values["not sent"] == "2"
+            told += 1
+    assert told >= 2
+
+
+ESTOP, INTENT = inbound_topics("")
+
+
+def said(data: object) -> SimpleNamespace:
+    return SimpleNamespace(data=data)
+
+
+def test_an_intent_is_passed_on_once_and_a_namespace_keeps_other_robots_requests_apart(
+    robot: RobotConfig,
+) -> None:
+    inbound = Inbound(robot)
+    inbound.receive(INTENT, said(80.0), T0)
+    intent = inbound.intent(T0, 3, None)
+    assert intent is not None
+    assert (intent.assist_n, intent.seq, intent.source) == (80.0, 3, SOURCE)
+    assert inbound.intent(T0, 4, None) is None
+    ros2 = msgspec.structs.replace(robot.ros2, namespace="a")
+    inbound = Inbound(msgspec.structs.replace(robot, ros2=ros2))
+    assert inbound_topics("a").estop.name == "/a/xrl/estop"
+    inbound.receive(inbound_topics("a").estop, said(True), T0)
+    assert inbound.stop_due(T0, heard(T0, *[Mode.TRACK] * 6), 6)
+
+
+@pytest.mark.parametrize("past", [-1e-9, math.nan, math.inf, -math.inf, 1e308])
+def test_a_force_that_cannot_be_given_is_refused_and_counted(
+    robot: RobotConfig, past: float
+) -> None:
+    inbound = Inbound(robot)
+    inbound.receive(INTENT, said(past), T0)
+    inbound.receive(INTENT, None, T0)
+    assert inbound.intent(T0, 0, None) is None
+    assert inbound.refused == 2
+
+
+@pytest.mark.parametrize("force", [0.0, 1.0])
+def test_the_limits_themselves_are_accepted(robot: RobotConfig, force: float) -> None:
+    inbound = Inbound(robot)
+    inbound.receive(INTENT, said(force * robot.assist.force_max), T0)
+    assert inbound.intent(T0, 0, None) is not None
+    inbound.receive(INTENT, said(math.nextafter(robot.assist.force_max, math.inf)), T0)
+    assert inbound.intent(T0, 0, None) is None
+
+
+@pytest.mark.parametrize(
+    ("by", "passes"), [("", True), (SCENARIO, True), (SOURCE, True), ("xrl lead by ann", False)]
+)
+def test_it_does_not_talk_another_operator_down(robot: RobotConfig, by: str, passes: bool) -> None:
+    inbound = Inbound(robot)
+    inbound.receive(INTENT, said(50.0), T0)
+    found = inbound.intent(T0, 0, planner_status(requested_by=by))
+    assert (found is not None) is passes
+    assert inbound.refused == (not passes)
+
+
+def heard(at_ns: int, *modes: Mode) -> list[tuple[int, int]]:
+    return [(at_ns, int(mode)) for mode in modes]
+
+
+def test_only_true_stops_and_a_stop_ignores_what_was_heard_before(robot: RobotConfig) -> None:
+    inbound = Inbound(robot)
+    tracking = heard(T0, *[Mode.TRACK] * 6)
+    inbound.receive(ESTOP, said(False), T0)
+    assert not inbound.stop_due(T0, tracking, 6)
+    inbound.receive(ESTOP, said(True), T0)
+    assert inbound.stop_due(T0, tracking, 6)
+    inbound.receive(ESTOP, said(False), T0)
+    assert inbound.stop_due(T0 + REPEAT_NS, tracking, 6), "nothing here ends a stop"
+    # Its link was cut; it may have armed since.
+    inbound = Inbound(robot)
+    inbound = Inbound(robot)
+    inbound.receive(ESTOP, said(True), T0)
+    old = heard(T0 - 1, *[Mode.DAMP] * 6)
+    assert all(inbound.stop_due(T0 + k * REPEAT_NS, old, 6) for k in range(10))
+
+
+@pytest.mark.parametrize(("mode", "others"), list(product(Mode, [Mode.DAMP, Mode.TRACK])))
+def test_a_stop_is_repeated_until_every_module_has_stopped(
+    robot: RobotConfig, mode: Mode, others: Mode
+) -> None:
+    """One that is DISARMED may arm a moment later: it has not stopped."""
+    inbound = Inbound(robot)
+    inbound.receive(ESTOP, said(True), T0)
+    puts = 0
+    for k in range(10):
+        now = T0 + k * REPEAT_NS
+        puts += inbound.stop_due(now, heard(now, mode, *[others] * 5), 6)
+    stopped = mode in (Mode.DAMP, Mode.FAULT) and others is Mode.DAMP
+    assert puts == (1 if stopped else 10), "once in any case: a module may have been silent"
+    assert not inbound.not_stopped
+
+
+def test_a_module_that_is_silent_has_not_stopped_and_giving_up_is_told(robot: RobotConfig) -> None:
+    inbound = Inbound(robot)
+    inbound.receive(ESTOP, said(True), T0)
+    times = range(T0, T0 + 2 * GIVE_UP_NS, REPEAT_NS)
+    puts = [at for at in times if inbound.stop_due(at, heard(at, *[Mode.DAMP] * 5), 6)]
+    assert puts[-1] - T0 == GIVE_UP_NS
+    assert inbound.not_stopped
+    inbound.receive(ESTOP, said(True), T0)
+    assert not inbound.not_stopped, "until it is asked for again"
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [("intent", ("intent",)), ("estop", ("estop",)), ("intent,estop", ("estop", "intent"))],
+)
+def test_what_may_be_accepted(words: str, names: tuple[str, ...]) -> None:
+    assert acceptable(words) == names
+
+
+@pytest.mark.parametrize("words", ["", ",", "all", "estop,command", "ESTOP"])
+def test_anything_else_is_one_clear_line(words: str) -> None:
+    with pytest.raises(FleetError, match="intent or estop or intent,estop is right"):
+        acceptable(words)

@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import pytest
 
-from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe, Timing
+from services.joint.failsafe import TRANSITIONS, TRIPS, Event, Failsafe
 from shared.bus.messages import Cause, Mode
-from tests.joint.helpers import SESSION, T0, command
+from tests.joint.helpers import SESSION, T0, TIMING, command
+
+GONE = (Event.DRIVE_LOST, Event.DRIVE_DISARMED, Event.POSITION_LOST)
 
 
 class Situation(NamedTuple):
@@ -17,166 +19,62 @@ class Situation(NamedTuple):
 
     mode: Mode
     drive: Event
+    trip: Event
+    """What the module saw of itself."""
     estop: bool
     fresh: bool
     hold: bool
     waited: bool
     """Commands have been fresh for long enough."""
-    trip: Event = Event.NONE
-    """What the module saw of itself."""
+    ended: bool
+    """The planner's process has ended since the last cycle."""
 
 
-DRIVE_EVENTS = (
-    Event.NONE,
-    Event.DRIVE_ARMED,
-    Event.DRIVE_DISARMED,
-    Event.DRIVE_LOST,
-    Event.POSITION_LOST,
-)
+def situations(mode: Mode) -> list[Situation]:
+    drives, trips = (Event.NONE, Event.DRIVE_ARMED, *GONE), (Event.NONE, *TRIPS)
+    flags = [(False, True)] * 5
+    return [Situation(mode, *rest) for rest in product(drives, trips, *flags)]
 
 
-TRIP_EVENTS = (Event.NONE, *TRIPS)
-
-
-FLAGS = (False, True)
-
-
-SITUATIONS = [
-    Situation(mode, drive, *flags, trip)
-    for mode, drive, trip in product(Mode, DRIVE_EVENTS, TRIP_EVENTS)
-    for flags in product(FLAGS, FLAGS, FLAGS, FLAGS)
-]
-
-
-def mode_by_the_docs(s: Situation) -> Mode:
-    """Return the state that docs/architecture.md#age-rule asks for.
+def by_the_docs(s: Situation) -> tuple[Mode, Cause | None]:
+    """Return the state that docs/architecture.md#age-rule asks for, and its cause if it changes.
 
     DISARMED -> HOLD (at power-up, once armed) <-> TRACK (fresh commands); DAMP (e-stop):
     stiffness never comes back by itself; FAULT (drive lost), which nothing leaves.
     """
     if s.mode is Mode.FAULT:
-        return Mode.FAULT
+        return Mode.FAULT, None
     if s.estop and s.mode is not Mode.DAMP:
-        return Mode.DAMP
-    gone = s.drive in (Event.DRIVE_LOST, Event.DRIVE_DISARMED, Event.POSITION_LOST)
+        return Mode.DAMP, Cause.ESTOP
     if s.mode is Mode.DISARMED:  # a drive that was never armed cannot be lost
-        return Mode.HOLD if s.drive is Event.DRIVE_ARMED else Mode.DISARMED
-    if gone:
-        return Mode.FAULT
-    if s.mode is Mode.DAMP:
-        return Mode.DAMP
-    wanted = s.fresh and not s.hold
+        armed = s.drive is Event.DRIVE_ARMED
+        return (Mode.HOLD, Cause.DRIVE_ARMED) if armed else (Mode.DISARMED, None)
+    if s.drive in GONE:
+        return Mode.FAULT, Cause[s.drive.name]
     if s.mode is Mode.TRACK:
-        return Mode.TRACK if wanted and s.trip is Event.NONE else Mode.HOLD
-    return Mode.TRACK if wanted and s.waited else Mode.HOLD
-
-
-def placed(s: Situation, timing: Timing) -> Failsafe:
-    """Return a failsafe in this situation at T0."""
-    age_ns = timing.max_command_age_ns + (0 if s.fresh else 1)
-    since_ns = T0 - timing.engage_after_ns + (0 if s.waited else 1)
-    return Failsafe(
-        mode=s.mode,
-        command=command(echo_t_ns=T0 - age_ns, hold=s.hold),
-        session=SESSION,
-        fresh_since_ns=since_ns,
-    )
-
-
-def test_the_sweep_knows_every_state_and_every_event() -> None:
-    assert set(TRANSITIONS) == set(Mode)
-    assert {*DRIVE_EVENTS, *TRIPS} | {
-        Event.ESTOP,
-        Event.PLANNER_ENDED,
-        Event.COMMAND_STALE,
-        Event.HOLD_REQUESTED,
-        Event.READY,
-    } == set(Event)
-    assert len(SITUATIONS) == 5 * 5 * 4 * 2**4
+        causes = (
+            (s.trip is not Event.NONE, s.trip.name), (s.ended, "PLANNER_ENDED"),
+            (not s.fresh, "COMMAND_STALE"), (s.hold, "HOLD_ALL"),
+        )  # fmt: skip
+        names = [name for applies, name in causes if applies]
+        return (Mode.HOLD, Cause[names[0]]) if names else (Mode.TRACK, None)
+    leads = s.fresh and not s.hold and s.waited and not s.ended
+    return (Mode.TRACK, Cause.COMMANDS_FRESH) if leads and s.mode is Mode.HOLD else (s.mode, None)
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_every_situation_leads_to_its_state_by_the_age_rule(mode: Mode, timing: Timing) -> None:
-    for situation in (s for s in SITUATIONS if s.mode is mode):
-        failsafe = placed(situation, timing)
-        cause = failsafe.advance(T0, timing, situation.drive, situation.estop, situation.trip)
-        assert failsafe.mode is mode_by_the_docs(situation), situation
-        assert (cause is None) == (failsafe.mode is mode), situation
-
-
-@pytest.mark.parametrize(("mode", "event"), list(product(Mode, Event)))
-def test_advance_follows_the_table_throughout(mode: Mode, event: Event, timing: Timing) -> None:
-    situation = Situation(
-        mode,
-        drive=event if event in DRIVE_EVENTS else Event.NONE,
-        estop=event is Event.ESTOP,
-        fresh=event is not Event.COMMAND_STALE,
-        hold=event is Event.HOLD_REQUESTED,
-        waited=event is Event.READY,
-        trip=event if event in TRIPS else Event.NONE,
-    )
-    failsafe = placed(situation, timing)
-    if event is Event.PLANNER_ENDED:
-        failsafe.end_session(SESSION)
-    cause = failsafe.advance(T0, timing, situation.drive, situation.estop, situation.trip)
-    assert (failsafe.mode, cause) == TRANSITIONS[mode].get(event, (mode, None))
-
-
-CAUSES = {
-    (Mode.DISARMED, Mode.HOLD): {Cause.DRIVE_ARMED},
-    (Mode.HOLD, Mode.TRACK): {Cause.COMMANDS_FRESH},
-    (Mode.TRACK, Mode.HOLD): {
-        Cause.PLANNER_ENDED,
-        Cause.COMMAND_STALE,
-        Cause.HOLD_ALL,
-        Cause.SHAKING,
-        Cause.TORQUE_LIMIT,
-        Cause.TOO_FAST,
-    },
-}
-
-
-def test_every_change_has_a_cause_that_fits_it() -> None:
-    for before, row in TRANSITIONS.items():
-        for after, cause in row.values():
-            if after is Mode.DAMP:
-                assert cause is Cause.ESTOP
-            elif after is Mode.FAULT:
-                assert cause in (Cause.DRIVE_LOST, Cause.DRIVE_DISARMED, Cause.POSITION_LOST)
-            else:
-                assert cause in CAUSES[before, after]
-
-
-@pytest.mark.parametrize("estop", FLAGS)
-@pytest.mark.parametrize("drive", DRIVE_EVENTS)
-def test_nothing_leaves_fault(drive: Event, estop: bool, timing: Timing) -> None:
-    for situation in (s for s in SITUATIONS if s.mode is Mode.FAULT):
-        failsafe = placed(situation, timing)
-        for _ in range(3):
-            failsafe.advance(T0, timing, drive, estop)
-        assert failsafe.mode is Mode.FAULT
-
-
-def test_only_a_lost_drive_leaves_damp(timing: Timing) -> None:
-    left = set()
-    for situation in (s for s in SITUATIONS if s.mode is Mode.DAMP):
-        failsafe = placed(situation, timing)
-        if failsafe.advance(T0, timing, situation.drive, situation.estop) is not None:
-            assert failsafe.mode is Mode.FAULT
-            left.add(situation.drive)
-    assert left == {Event.DRIVE_LOST, Event.DRIVE_DISARMED, Event.POSITION_LOST}
-
-
-def test_an_emergency_stop_that_is_released_again_stays_in_damp(timing: Timing) -> None:
-    failsafe = placed(Situation(Mode.TRACK, Event.NONE, True, True, False, True), timing)
-    failsafe.advance(T0, timing, Event.DRIVE_ARMED, estop=True)
-    failsafe.advance(T0, timing, Event.DRIVE_ARMED, estop=False)
-    assert failsafe.mode is Mode.DAMP
-
-
-def test_emergency_stop_and_lost_drive_in_one_cycle_end_in_fault(timing: Timing) -> None:
-    for mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP):
-        failsafe = placed(Situation(mode, Event.NONE, True, True, False, True), timing)
-        failsafe.advance(T0, timing, Event.DRIVE_LOST, estop=True)
-        failsafe.advance(T0, timing, Event.DRIVE_LOST, estop=True)
-        assert failsafe.mode is Mode.FAULT
+def test_every_situation_leads_to_its_state_for_its_cause_by_the_age_rule(mode: Mode) -> None:
+    found = set()
+    for s in situations(mode):
+        failsafe = Failsafe(
+            mode=s.mode,
+            command=command(echo_t_ns=T0 - TIMING.max_command_age_ns - (not s.fresh), hold=s.hold),
+            session=SESSION,
+            fresh_since_ns=T0 - TIMING.engage_after_ns + (not s.waited),
+        )
+        if s.ended:
+            failsafe.end_session(SESSION)
+        cause = failsafe.advance(T0, TIMING, s.drive, s.estop, s.trip)
+        assert (failsafe.mode, cause) == by_the_docs(s), s
+        found |= {(failsafe.mode, cause)} if cause is not None else set()
+    assert found == set(TRANSITIONS[mode].values()), "the sweep brings about every transition"

@@ -366,11 +366,6 @@ def test_session_that_cannot_be_opened_is_one_clear_error(
     assert "\n" not in str(caught.value)
 
 
-def test_a_tool_listens_at_no_endpoint_that_there_cannot_be(run_dir: Path) -> None:
-    with pytest.raises(BusError, match="a port from 1 to 65535"):
-        open_session(ROBOT, TOOL, run_dir, listen=["tcp/127.0.0.1:0"])
-
-
 USES_REFUSED: dict[str, Callable[[Session], object]] = {
     "harness/wrench: Estop is not its type; use W": lambda s: s.publisher(topics.WRENCH, Estop),
     r"joint/\*/command: '' is no module": lambda s: s.latest(topics.JOINT_COMMAND, JointCommand),
@@ -379,11 +374,15 @@ USES_REFUSED: dict[str, Callable[[Session], object]] = {
 }
 
 
-def test_topic_used_with_a_wrong_type_or_module_is_refused(run_dir: Path) -> None:
+def test_a_session_that_cannot_listen_is_refused_and_so_is_a_wrong_type_or_module(
+    run_dir: Path,
+) -> None:
     with open_session(ROBOT, "planner", run_dir) as session:
         for why, use in USES_REFUSED.items():
             with pytest.raises(BusError, match=why):
                 use(session)
+    with pytest.raises(BusError, match="a port from 1 to 65535"):
+        open_session(ROBOT, TOOL, run_dir, listen=["tcp/127.0.0.1:0"])
 
 
 def test_mute_and_absent_peers_delay_neither_opening_nor_closing(run_dir: Path) -> None:

@@ -70,13 +70,10 @@ def test_an_extra_brings_the_packages_that_the_table_says(extra: str) -> None:
         assert brings & packages_of(extra) or (not brings and extra in UNLOCKED), name
 
 
-def test_a_robots_lock_holds_its_packages_and_those_of_no_extra() -> None:
+def test_locks_hold_what_their_extras_say_and_the_page_counts_them() -> None:
     held = locked("requirements.runtime.lock")
     assert {distribution(requirement) for requirement in PROJECT["dependencies"]} <= held
     assert held & set().union(*(packages_of(extra) for extra in EXTRAS)) == set()
-
-
-def test_the_page_counts_a_robots_packages() -> None:
     page = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
     assert f"{len(locked('requirements.runtime.lock'))} packages, 0.9 GB" in page
     for extra in ON_ROBOTS:
@@ -84,6 +81,10 @@ def test_the_page_counts_a_robots_packages() -> None:
         count = sum("; sys_platform == 'win32'" not in line for line in lines)
         row = next(line for line in page.splitlines() if line.startswith(f"| `{extra}` |"))
         assert f"| {count} |" in row
+    held = locked("requirements.lock")
+    for extra in set(EXTRAS) - {*UNLOCKED, "pad"}:
+        assert packages_of(extra) <= held, extra
+    assert "evdev-binary" in held
 
 
 @pytest.mark.parametrize("extra", sorted(ON_ROBOTS))
@@ -92,13 +93,6 @@ def test_a_lock_of_some_robots_holds_what_it_adds_to_a_robots_lock(extra: str) -
     assert packages_of(extra) <= held
     assert held & locked("requirements.runtime.lock") == set()
     assert held <= locked("requirements.lock")
-
-
-def test_the_whole_lock_holds_every_extra_that_is_said_to_be_in_it() -> None:
-    held = locked("requirements.lock")
-    for extra in set(EXTRAS) - {*UNLOCKED, "pad"}:
-        assert packages_of(extra) <= held, extra
-    assert "evdev-binary" in held
 
 
 def test_what_is_absent_is_told_with_its_extra_and_what_brings_it(
@@ -135,16 +129,13 @@ def test_outside_of_a_checkout_pip_brings_it(
         require("view")
 
 
-def test_a_late_module_is_imported_when_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_late_module_is_imported_when_it_is_used_and_says_if_it_is_absent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delitem(sys.modules, "mujoco", raising=False)
     mujoco = late("mujoco")
     assert "mujoco" not in sys.modules
     assert mujoco.mj_step is sys.modules["mujoco"].mj_step
-
-
-def test_a_late_module_that_is_absent_says_so_when_it_is_used(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
     monkeypatch.setitem(sys.modules, "cvxpy", None)
     cvxpy = late("cvxpy")
     with pytest.raises(MissingPackageError, match=r"^cvxpy is not installed; the extra `design`"):

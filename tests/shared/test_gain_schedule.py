@@ -74,16 +74,15 @@ def test_a_schedule_comes_back_from_a_file_of_one_node_a_line_that_replaces_an_o
     assert json.loads(path.read_bytes())["version"] == gain_schedule.VERSION
 
 
-def test_a_folder_that_is_not_there_is_one_line(schedule: GainSchedule, tmp_path: Path) -> None:
+def test_a_schedule_lies_beside_the_robot_file_or_the_missing_folder_is_named(
+    schedule: GainSchedule, tmp_path: Path
+) -> None:
+    for robot_file, beside in (("lab.toml", "lab.gains.json"), ("a/b.2.toml", "a/b.2.gains.json")):
+        assert gain_schedule.path_beside(Path(robot_file)) == Path(beside)
     path = tmp_path / "none" / "lab.gains.json"
     with pytest.raises(ConfigError, match="cannot be written: No such file") as caught:
         gain_schedule.write(path, schedule)
     assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_the_schedule_lies_beside_the_robot_file() -> None:
-    for robot_file, beside in (("lab.toml", "lab.gains.json"), ("a/b.2.toml", "a/b.2.gains.json")):
-        assert gain_schedule.path_beside(Path(robot_file)) == Path(beside)
 
 
 SHIPPED = gain_schedule.path_beside(ROBOT_FILE).read_bytes()
@@ -146,12 +145,9 @@ def test_a_corrupt_file_is_refused_in_one_line_with_the_command_to_run(
     assert "\n" not in str(error)
 
 
-def test_the_shipped_schedule_fits_the_shipped_robot(robot: RobotConfig) -> None:
+def test_the_shipped_schedule_fits_the_robot_however_it_is_read(robot: RobotConfig) -> None:
     assert gain_schedule.why_stale(robot) == ""
     gain_schedule.require(robot, ROBOT_FILE)
-
-
-def test_a_robot_read_from_its_own_toml_has_the_same_digest(robot: RobotConfig) -> None:
     again = config_file.parse(config_file.to_toml(robot), "again.toml")
     assert digest_of(inputs_of(again)) == digest_of(inputs_of(robot))
 
@@ -166,15 +162,7 @@ def test_every_input_that_differs_is_named_with_both_values(robot: RobotConfig, 
     assert gain_schedule.why_stale(other) == expected
 
 
-def test_mass_lengths_stiffness_and_limits_are_among_the_inputs() -> None:
-    assert {
-        "mass.payload", "mass.module", "geometry.l1", "geometry.l2", "geometry.harness_point",
-        "law.K_p", "law.K_0", "law.S", "certificate.K_required", "assist.force_max",
-        "joint_service.k_p_max", "limits.knee",
-    } <= set(INPUTS)  # fmt: skip
-
-
-def test_what_the_schedule_does_not_depend_on_leaves_it_fitting(robot: RobotConfig) -> None:
+def test_only_mass_lengths_stiffness_and_limits_are_inputs(robot: RobotConfig) -> None:
     other = changed(
         robot,
         law={"split": "certified", "recentre_s": 9.0},
@@ -183,9 +171,14 @@ def test_what_the_schedule_does_not_depend_on_leaves_it_fitting(robot: RobotConf
         joint={"encoder_counts_per_turn": 4096},
     )
     assert gain_schedule.why_stale(other) == ""
+    assert {
+        "mass.payload", "mass.module", "geometry.l1", "geometry.l2", "geometry.harness_point",
+        "law.K_p", "law.K_0", "law.S", "certificate.K_required", "assist.force_max",
+        "joint_service.k_p_max", "limits.knee",
+    } <= set(INPUTS)  # fmt: skip
 
 
-def test_a_schedule_whose_inputs_were_edited_by_hand_is_stale(
+def test_a_schedule_of_other_inputs_or_another_version_is_stale(
     robot: RobotConfig, schedule: GainSchedule
 ) -> None:
     """The digest is what counts."""
@@ -193,22 +186,14 @@ def test_a_schedule_whose_inputs_were_edited_by_hand_is_stale(
     forged = msgspec.structs.replace(schedule, inputs=inputs_of(other))
     other = msgspec.structs.replace(other, gain_schedule=forged)
     assert gain_schedule.why_stale(other) == "the gain schedule's digest is not that of its inputs"
-
-
-def test_another_version_is_stale(robot: RobotConfig, schedule: GainSchedule) -> None:
     older = msgspec.structs.replace(schedule, version=gain_schedule.VERSION + 1)
     other = msgspec.structs.replace(robot, gain_schedule=older)
     assert "version 3, not 2" in gain_schedule.why_stale(other)
 
 
-def test_a_schedule_without_bounds_is_refused_with_the_command_to_run(robot: RobotConfig) -> None:
-    """One by an older `xrl gains`: its joint services would believe anything."""
-    with pytest.raises(ConfigError, match="no bounds") as refused:
-        gain_schedule.require(gain_schedule.believing(robot), Path("lab.toml"))
-    assert "xrl gains --config lab.toml" in str(refused.value)
-
-
-def test_only_the_certified_split_requires_a_schedule(robot: RobotConfig) -> None:
+def test_only_the_certified_split_requires_a_schedule_and_that_with_bounds(
+    robot: RobotConfig,
+) -> None:
     bare = msgspec.structs.replace(robot, gain_schedule=None)
     with pytest.raises(ConfigError) as caught:
         gain_schedule.require(bare, Path("lab.toml"))
@@ -216,6 +201,10 @@ def test_only_the_certified_split_requires_a_schedule(robot: RobotConfig) -> Non
         "lab.gains.json: (file): there is no gain schedule; run `xrl gains --config lab.toml`"
     )
     gain_schedule.require(changed(bare, law={"split": "diagonal"}), Path("lab.toml"))
+    # One by an older `xrl gains`: its joint services would believe anything.
+    with pytest.raises(ConfigError, match="no bounds") as refused:
+        gain_schedule.require(gain_schedule.believing(robot), Path("lab.toml"))
+    assert "xrl gains --config lab.toml" in str(refused.value)
 
 
 def test_a_planner_with_a_stale_schedule_refuses_to_start_with_the_command_to_run(

@@ -1,10 +1,14 @@
-"""Drop-outs are counted up to a maximum, and each steady time forgets one."""
+"""Rules of the control path: a clamp, and drop-outs that are counted and forgotten."""
 
 from __future__ import annotations
 
-from hypothesis import given
+import math
+import struct
+
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
+from shared.clamp import clamp
 from shared.robot.hold_rules import Dropouts
 
 COUNT_MAX, FORGET_NS, T0 = 3, 1000, 50_000
@@ -30,15 +34,12 @@ def test_each_steady_time_forgets_one_drop_out() -> None:
         assert advance(dropouts, T0 + after_ns) == left, after_ns
 
 
-def test_a_drop_out_restarts_the_steady_time() -> None:
+def test_a_drop_out_restarts_the_steady_time_and_counts_only_while_engaged() -> None:
     dropouts = Dropouts(count=1, steady_since_ns=T0)
     assert advance(dropouts, T0 + FORGET_NS - 1, dropped=True) == 2
     assert dropouts.last_ns == T0 + FORGET_NS - 1
     assert advance(dropouts, T0 + 2 * FORGET_NS - 2) == 2
     assert advance(dropouts, T0 + 2 * FORGET_NS - 1) == 1
-
-
-def test_no_drop_out_is_counted_while_not_engaged() -> None:
     dropouts = Dropouts()
     assert advance(dropouts, T0, engaged=False, dropped=True) == 0
     assert dropouts.last_ns == 0
@@ -55,3 +56,21 @@ def test_the_count_stays_between_zero_and_its_maximum_and_changes_by_one(
         assert 0 <= count <= COUNT_MAX
         assert abs(count - before) <= 1
         before = count
+
+
+NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
+LIMITS = st.floats(allow_nan=False)
+
+
+@given(NUMBERS, LIMITS, LIMITS)
+@example(-0.0, -1.0, 0.0)
+@example(0.0, -0.0, 1.0)
+def test_it_is_the_built_ins_to_the_last_bit(value: float, a: float, b: float) -> None:
+    low, high = min(a, b), max(a, b)
+    assume(low < high)
+    expected = min(high, max(low, value))
+    assert struct.pack("<d", clamp(value, low, high)) == struct.pack("<d", expected)
+
+
+def test_a_nan_becomes_the_lower_limit() -> None:
+    assert clamp(math.nan, -1.0, 2.0) == -1.0

@@ -1,17 +1,32 @@
+"""The robot file that is used, whose the run directory is, and who may read what lies in it."""
+
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import errno
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from shared import places
-from shared.exceptions import ConfigError, RunError
+from services.joint.neighbours import Neighbours
+from services.joint.rearm_guard import LastState, RearmGuard, path_of
+from shared import places, run_directory
+from shared.exceptions import ConfigError, FleetError, RunError
 from shared.places import DEFAULT_CONFIG
 from shared.process import service_parser
+from shared.run_directory import (
+    FLEET_VARIABLE,
+    check_own,
+    live_dir,
+    make_live_dir,
+    mapped,
+    open_private,
+    service_directory,
+)
 from tests.tools.exit_codes import exit_code
 from tools.bringup import drive_access
 from tools.fleet.run_dir import RunDir
@@ -20,8 +35,8 @@ from tools.verbs import estop
 
 SAID = "config: ./robot.toml\n"
 DECIDE_LATER = {
-    "doctor", "drive configure", "drive identify body", "drive identify joint", "drive jog",
-    "drive zero", "estop", "log explain", "view",
+    "doctor", "drive configure", "drive identify", "drive jog", "drive zero", "estop",
+    "log explain", "view",
 }  # fmt: skip
 """Verbs that take a running fleet's or a record's robot before they look for a file."""
 
@@ -42,7 +57,7 @@ def own_defaults() -> Iterator[tuple[str, object]]:
                     yield verb.name, field.default if made is dataclasses.MISSING else made
 
 
-def test_a_robot_file_of_the_working_directory_is_taken_and_named_but_one_that_is_named_wins(
+def test_a_robot_file_of_the_working_directory_is_taken_even_if_its_link_leads_nowhere(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     here.write_text("")
@@ -52,6 +67,9 @@ def test_a_robot_file_of_the_working_directory_is_taken_and_named_but_one_that_i
     assert capsys.readouterr().err == SAID
     assert places.robot_file(Path("lab.toml")) == Path("lab.toml")
     assert capsys.readouterr().err == ""
+    here.unlink()
+    here.symlink_to("lost.toml")
+    assert places.robot_file() == here
 
 
 @pytest.mark.parametrize("folder", [None, DEFAULT_CONFIG.parent])
@@ -62,11 +80,6 @@ def test_without_one_of_ones_own_it_is_the_shipped_one_and_nothing_is_said(
     monkeypatch.chdir(folder or tmp_path)
     assert places.robot_file() == DEFAULT_CONFIG
     assert capsys.readouterr().err == ""
-
-
-def test_a_link_that_leads_nowhere_does_not_let_the_shipped_robot_in(here: Path) -> None:
-    here.symlink_to("lost.toml")
-    assert places.robot_file() == here
 
 
 def test_another_users_robot_file_is_not_taken_unasked(
@@ -88,23 +101,17 @@ def test_every_verb_that_takes_a_robot_file_looks_for_one() -> None:
     assert len(found) > 2 * len(DECIDE_LATER)
 
 
-def test_an_empty_name_is_no_search(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_file_of_another_kind_or_name_is_an_error_that_names_it(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     here.write_text("")
     assert exit_code(["gains", "--stiffness", "--config", ""]) == 2
     assert SAID not in capsys.readouterr().err
-
-
-def test_a_file_of_another_kind_is_named_in_the_error(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     here.write_text('[vacuum]\nname = "cleaner"\n')
     assert exit_code(["gains", "--stiffness"]) == 2
     told = capsys.readouterr().err
     assert told.startswith(f"{SAID}xrl: {here}: ")
     assert told.count("\n") == 2
-
-
-def test_a_flag_before_the_verb_is_told_where_it_goes(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code(["--config", "lab.toml", "sim"]) == 2
     assert "--config comes after the verb" in capsys.readouterr().err
 
@@ -143,3 +150,139 @@ def test_a_wheel_says_what_needs_a_checkout_and_its_files_are_not_written_to(
         places.need_checkout("--against")
     with pytest.raises(RunError, match="xrl new DIR"):
         places.refuse_shipped(tmp_path / "robot.gains.json")
+
+
+AS_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="gives a directory to somebody else")
+
+
+@pytest.fixture
+def umask_0() -> Iterator[None]:
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+def mode_of(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+@pytest.mark.usefixtures("umask_0")
+def test_shared_memory_is_its_users_alone_whatever_the_umask(tmp_path: Path) -> None:
+    RearmGuard(tmp_path, "knee_left")
+    Neighbours(tmp_path, "knee_left")
+    assert {mode_of(path) for path in live_dir(tmp_path).iterdir()} == {0o600}
+
+
+def test_shared_memory_is_its_users_alone_whatever_the_umask_and_the_mode_before(
+    tmp_path: Path,
+) -> None:
+    RearmGuard(tmp_path, "knee_left").write(LastState.DAMP)
+    path_of(tmp_path, "knee_left").chmod(0o666)
+    assert RearmGuard(tmp_path, "knee_left").read() is LastState.DAMP
+    assert mode_of(path_of(tmp_path, "knee_left")) == 0o600
+
+
+def test_a_link_is_not_followed_and_a_way_over_one_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "aim").touch()
+    (tmp_path / "link").symlink_to("aim")
+    with pytest.raises(OSError, match="symbolic link"):
+        open_private(tmp_path / "link")
+    (tmp_path / "mine" / "run").mkdir(parents=True)
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    (tmp_path / "open" / "link").symlink_to(tmp_path / "mine")
+    with pytest.raises(FleetError, match="others may write to"):
+        check_own(tmp_path / "open" / "link" / "run")
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_directory_that_others_could_replace_is_refused(there: bool, tmp_path: Path) -> None:
+    open_to_all = tmp_path / "open"
+    run_dir = open_to_all / "below" / "run"
+    (run_dir if there else open_to_all).mkdir(parents=True)
+    open_to_all.chmod(0o777)
+    with pytest.raises(FleetError, match=r"others may write to .*/open and replace it; `chmod"):
+        check_own(run_dir)
+    check_own(run_dir, alone=False)  # it can still be stopped
+    open_to_all.chmod(0o1777)
+    check_own(run_dir)
+
+
+def test_a_service_by_hand_is_refused_there_and_a_successor_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A module whose service crashed is to be held, whatever has become of the directory."""
+    tmp_path.chmod(0o777)
+    monkeypatch.delenv(FLEET_VARIABLE, raising=False)
+    with pytest.raises(argparse.ArgumentTypeError, match="others may write to it"):
+        service_directory(str(tmp_path))
+    monkeypatch.setenv(FLEET_VARIABLE, str(tmp_path))
+    assert service_directory(str(tmp_path)) == tmp_path
+
+
+IN_MEMORY = pytest.mark.skipif(
+    live_dir(Path("/nowhere")) == Path("/nowhere"), reason="this host has no folder in memory"
+)
+
+
+@IN_MEMORY
+def test_the_live_directory_is_in_memory_found_by_any_path_and_private(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    (tmp_path / "link").symlink_to(run_dir)
+    live = make_live_dir(run_dir)
+    assert live_dir(tmp_path / "link") == live_dir(tmp_path / "." / "run") == live
+    assert live_dir(tmp_path / "other") != live
+    assert live.parent in run_directory._MEMORY_FOLDERS
+    assert mode_of(live) == 0o700
+
+
+def test_without_a_folder_in_memory_the_live_directory_is_the_run_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folders in ((), (tmp_path,), (Path("/proc"),), (Path("/nowhere"),)):
+        monkeypatch.setattr(run_directory, "_MEMORY_FOLDERS", folders)
+        assert live_dir(tmp_path / "run") == tmp_path / "run"
+
+
+@IN_MEMORY
+@pytest.mark.parametrize("mode", [0o777, 0o770])
+def test_a_live_directory_that_others_may_write_to_is_refused(tmp_path: Path, mode: int) -> None:
+    live = make_live_dir(tmp_path)
+    live.chmod(mode)
+    with pytest.raises(FleetError, match=rf"{live}: others may write to it"):
+        check_own(tmp_path)
+    check_own(tmp_path, alone=False)
+
+
+@AS_ROOT
+@IN_MEMORY
+def test_a_strangers_live_directory_is_refused_and_a_strangers_parent_too(tmp_path: Path) -> None:
+    os.chown(make_live_dir(tmp_path), 12345, 12345)
+    with pytest.raises(FleetError, match="belongs to another user"):
+        check_own(tmp_path, alone=False)
+    (tmp_path / "theirs" / "run").mkdir(parents=True)
+    os.chown(tmp_path / "theirs", 12345, 12345)
+    with pytest.raises(FleetError, match="theirs belongs to another user, who can replace it"):
+        check_own(tmp_path / "theirs" / "run")
+
+
+def test_memory_that_a_read_only_disk_refuses_is_an_error_that_names_file_and_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(run_directory, "open_private", refuse)
+    with pytest.raises(FleetError, match=rf"{tmp_path}/x: .*the disk is read-only: .*`dmesg`"):
+        mapped(tmp_path / "x", 8)
+
+
+def test_the_remedy_can_be_pasted_into_a_shell(tmp_path: Path) -> None:
+    odd = tmp_path / "a #b; c"
+    odd.mkdir()
+    odd.chmod(0o777)
+    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
+        check_own(odd)
+    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
+        check_own(odd / "run")

@@ -97,7 +97,6 @@ def test_a_refusal_names_file_key_value_and_what_would_be_right(
 
 PLAIN_FAULT = {"module": "hip_left", "kind": "watchdog", "at": 1}
 
-
 HELD = {"at": 1.0, "height": 1.1, "side": 0.02}
 
 
@@ -110,16 +109,13 @@ def test_a_scenario_is_taken_and_comes_back_from_its_own_toml(tmp_path: Path, ab
     assert first.name == "two"
 
 
-def test_a_fault_is_of_the_first_axis_and_lasts_as_its_kind_does_by_default() -> None:
+def test_faults_last_as_their_kind_does_by_default_and_every_kind_is_in_the_table() -> None:
     for kind, traits in FAULT_KINDS.items():
         plain = msgspec.convert({"module": "hip_left", "kind": kind, "at": 1.0}, Fault)
         assert plain.axis is None
         assert plain.lasts_s == (traits.duration or 0.0)
     given = Fault(module="hip_left", kind="link_lost", at=1.0, duration=3.0)
     assert given.lasts_s == 3.0
-
-
-def test_every_kind_in_the_type_is_in_the_table() -> None:
     assert set(get_args(FaultKind)) == set(FAULT_KINDS)
 
 
@@ -151,15 +147,12 @@ def test_lead_and_its_rates_are_continuous_and_fit_each_other(path: Path) -> Non
     assert np.ptp(height) > (0.1 if path == SHIFT else 0.2)
 
 
-def test_squat_is_the_cosine_of_the_reference_scenario() -> None:
+def test_squat_and_crawl_are_those_of_the_reference() -> None:
     squat = scenarios.load(SQUAT)
     for t in np.linspace(0.0, 10.0, 1001):
         expected = 1.188 - 0.12 * (1.0 - math.cos(2.0 * math.pi * t / 5.0))
         assert lead(squat, t).height == pytest.approx(expected, abs=1e-12)
         assert (lead(squat, t).pitch, lead(squat, t).assist) == (0.0, 0.0)
-
-
-def test_squat_kills_the_planner_and_pushes_as_in_the_reference_scenario() -> None:
     squat = scenarios.load(SQUAT)
     assert squat.kill == (Kill(service="planner", at=10.0, signal="KILL"),)
     assert squat.push == tuple(
@@ -167,16 +160,13 @@ def test_squat_kills_the_planner_and_pushes_as_in_the_reference_scenario() -> No
         for at, x, y in ((12.0, 40.0, 0.0), (14.0, 0.0, 40.0), (16.0, -40.0, 0.0))
     )
     assert (squat.duration, squat.hand) == (20.0, True)
-
-
-def test_crawl_is_the_reference_scenarios() -> None:
     crawl = scenarios.load(CRAWL)
     for t in (5.0, 7.5, 10.0):
         assert lead(crawl, t)[:5] == pytest.approx((0.79, 0.0, 1.2, 0.0, 200.0), abs=1e-12)
     assert lead(crawl, 15.0).height == pytest.approx(1.188)
 
 
-def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
+def test_lead_waits_at_the_first_keyframe_stays_at_the_last_and_holds_sideways_if_asked() -> None:
     frames = (Keyframe(at=1.0, height=1.1), Keyframe(at=3.0, height=0.9, pitch=0.4))
     two = Scenario(name="two", about="", duration=10.0, keyframe=frames)
     for t in (-5.0, 0.0, 1.0):
@@ -185,9 +175,6 @@ def test_lead_waits_at_the_first_keyframe_and_stays_at_the_last() -> None:
         assert lead(two, t)[:5] == (0.9, 0.0, 0.4, 0.0, 0.0)
     stand = Scenario(name="one", about="", duration=1.0, keyframe=frames[:1])
     assert {lead(stand, t).height for t in (-1.0, 0.0, 1.5, 2.0)} == {1.1}
-
-
-def test_sideways_it_is_held_between_keyframes_that_say_where_and_else_left_free() -> None:
     sides = (None, 0.02, -0.04, None)
     frames = tuple(Keyframe(at=float(at), height=1.1, side=side) for at, side in enumerate(sides))
     leaned = Scenario(name="leaned", about="", duration=10.0, keyframe=frames)
@@ -198,15 +185,12 @@ def test_sideways_it_is_held_between_keyframes_that_say_where_and_else_left_free
     assert lead(leaned, 1.3).side_rate == pytest.approx(np.diff(sides_there)[0] / (2 * dt))
 
 
-def test_a_push_acts_from_its_start_up_to_its_end() -> None:
+def test_pushes_act_from_start_to_end_and_add_up() -> None:
     squat = scenarios.load(SQUAT)
     before, start = push_at(squat, math.nextafter(12.0, 0.0)), push_at(squat, 12.0)
     last, end = push_at(squat, math.nextafter(12.3, 0.0)), push_at(squat, 12.3)
     assert before == end == (0.0, 0.0, 0.0)
     assert start == last == (40.0, 0.0, 0.0)
-
-
-def test_pushes_at_one_time_add_up() -> None:
     one = Push(at=0.0, duration=2.0, force=(1.0, 2.0, 3.0))
     other = Push(at=1.0, duration=2.0, force=(10.0, 0.0, -3.0))
     frames = (Keyframe(at=0.0, height=1.0),)

@@ -10,8 +10,8 @@ import math
 import numpy as np
 import pytest
 
-from services.simulator.drives.axis_bank import AxisErrors
 from services.simulator.drives.axis_calibration import INDUCTANCE_S, LOCK_S, RESISTANCE_S
+from services.simulator.drives.axis_faults import AxisErrors
 from services.simulator.drives.axis_settings import PHASE_INDUCTANCE, PHASE_RESISTANCE, POLE_PAIRS
 from shared.can.cansimple import AxisError, AxisState, ControlMode, EncoderError, MotorError
 from tests.simulator.banks import CPR, DT, FreeRotors, make_bank
@@ -92,16 +92,6 @@ def test_the_full_sequence_takes_its_time_turns_the_shaft_out_and_back_and_finds
     assert rotor.bank.state[2] == AxisState.CLOSED_LOOP_CONTROL
 
 
-def test_an_encoders_calibration_forgets_the_turns_in_the_moment_it_begins() -> None:
-    rotor = Rotor()
-    rotor.bank.calibration.motor[2] = True
-    rotor.ask(ENCODER)
-    assert rotor.bank.encoder_turns[2] == pytest.approx(0.28, abs=1e-3)
-    rotor.run(DT)
-    assert rotor.bank.pos_estimate[2] == pytest.approx(0.28, abs=1e-2)
-    assert abs(rotor.bank.vel_estimate[2]) < 0.1, "and its rate knows nothing of it"
-
-
 @pytest.mark.parametrize(
     ("motor", "direction", "fault"),
     [
@@ -122,13 +112,20 @@ def test_closed_loop_says_what_is_not_calibrated(
     assert moved == bool(fault.motor), "it armed for a cycle, from where it is"
 
 
-def test_an_encoder_is_not_calibrated_before_its_motor() -> None:
+def test_an_encoder_calibrates_after_its_motor_and_forgets_its_turns_as_it_begins() -> None:
     rotor = Rotor()
     rotor.ask(ENCODER)
     assert rotor.bank.faults[2].axis == AxisError.INVALID_STATE
     assert rotor.bank.encoder_turns[2] == pytest.approx(AT, abs=1e-3)
     rotor.bank.request_state(3, ENCODER)
     assert rotor.bank.state[3] == ENCODER, "its sibling's motor is calibrated"
+    rotor = Rotor()
+    rotor.bank.calibration.motor[2] = True
+    rotor.ask(ENCODER)
+    assert rotor.bank.encoder_turns[2] == pytest.approx(0.28, abs=1e-3)
+    rotor.run(DT)
+    assert rotor.bank.pos_estimate[2] == pytest.approx(0.28, abs=1e-2)
+    assert abs(rotor.bank.vel_estimate[2]) < 0.1, "and its rate knows nothing of it"
 
 
 VIOLATION = AxisErrors(AxisError.MOTOR_FAILED, motor=MotorError.CURRENT_LIMIT_VIOLATION)
@@ -219,18 +216,6 @@ def test_what_a_request_for_idle_leaves_behind_is_half_a_measurement(
     assert rotor.found("motor.config.phase_resistance") == PHASE_RESISTANCE, "as it was saved"
 
 
-def test_a_watchdog_that_is_not_fed_ends_a_calibration() -> None:
-    """Native (USB) writes do not feed it."""
-    rotor = Rotor()
-    rotor.ask(MOTOR)
-    rotor.run(1.0)
-    rotor.bank.settings.set(1, "axis0.config.watchdog_timeout", 0.1)
-    rotor.bank.settings.set(1, "axis0.config.enable_watchdog", value=True)
-    rotor.run(0.12)
-    assert rotor.bank.faults[2] == AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED)
-    assert (rotor.bank.state[2], rotor.calibrated) == (AxisState.IDLE, (False, False))
-
-
 @pytest.mark.parametrize("state", [MOTOR, ENCODER])
 def test_with_an_error_latched_nothing_is_measured_and_nothing_said(state: AxisState) -> None:
     rotor = Rotor()
@@ -247,9 +232,18 @@ def test_with_an_error_latched_nothing_is_measured_and_nothing_said(state: AxisS
         assert rotor.bank.encoder_turns[2] == pytest.approx(0.28, abs=1e-3), "the zero is gone"
 
 
-def test_an_axis_that_calibrates_takes_no_torque_from_its_inputs() -> None:
+def test_a_calibration_ignores_the_input_torque_and_ends_with_an_unfed_watchdog() -> None:
     rotor = Rotor()
     rotor.bank.input_torque[2] = 1.0
     rotor.ask(MOTOR)
     rotor.run(MOTOR_S - 0.5)
     assert rotor.bank.torque[2] == pytest.approx(0.0, abs=1e-6)
+    # Native (USB) writes do not feed it.
+    rotor = Rotor()
+    rotor.ask(MOTOR)
+    rotor.run(1.0)
+    rotor.bank.settings.set(1, "axis0.config.watchdog_timeout", 0.1)
+    rotor.bank.settings.set(1, "axis0.config.enable_watchdog", value=True)
+    rotor.run(0.12)
+    assert rotor.bank.faults[2] == AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED)
+    assert (rotor.bank.state[2], rotor.calibrated) == (AxisState.IDLE, (False, False))

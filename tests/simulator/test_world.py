@@ -49,9 +49,7 @@ def powers(world: World, torque: Array) -> tuple[float, float]:
     return float(at_joints), at_motors
 
 
-def test_at_the_start_it_stands_level_soles_flat_where_the_planner_takes_it_to_be(
-    robot: RobotConfig,
-) -> None:
+def test_at_the_start_it_stands_level_where_the_planner_assumes_it(robot: RobotConfig) -> None:
     world = world_of(robot)
     truth = seen(world)
     assert truth.torso[2] == pytest.approx(robot.simulation.stand_height, abs=5e-4)
@@ -66,11 +64,6 @@ def test_at_the_start_it_stands_level_soles_flat_where_the_planner_takes_it_to_b
         assert foot.xpos[2] == pytest.approx(0.0, abs=1e-3)
         heading = foot.xmat.reshape(3, 3)[:, 0]
         assert heading[1] == pytest.approx(0.0, abs=2e-3)  # toes forward
-
-
-def test_the_world_asks_for_dense_matrices(robot: RobotConfig) -> None:
-    """MuJoCo's sparse Newton solver was wrong in 4.0.0 (services/simulator/physics/body.py)."""
-    assert world_of(robot).model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE
 
 
 @pytest.mark.parametrize("plant", [IDEAL, PlantConfig()], ids=["ideal", "realistic"])
@@ -91,15 +84,19 @@ def test_a_torque_that_resets_mujoco_is_a_fall(
     assert all(map(math.isfinite, (*world.data.qpos, *world.hidden())))
 
 
-def test_a_push_that_resets_mujoco_is_a_fall(robot: RobotConfig) -> None:
+def test_a_push_that_resets_mujoco_is_a_fall_with_dense_matrices(robot: RobotConfig) -> None:
     world = world_of(robot, push=(Push(at=0.0, duration=1.0, force=(1e300, 0.0, 0.0)),))
     world.start()
     world.remove_hoist()
     run(world, 0.01)
     assert seen(world).fallen
+    # MuJoCo's sparse Newton solver was wrong in 4.0.0 (services/simulator/physics/body.py).
+    assert world_of(robot).model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE
 
 
-def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
+def test_motors_and_joints_agree_by_the_differential_and_have_the_same_power(
+    robot: RobotConfig,
+) -> None:
     """q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N (docs/law.md#the-robot)."""
     world = world_of(robot)
     rng = np.random.default_rng(1)
@@ -113,9 +110,6 @@ def test_motor_turns_obey_the_differential(robot: RobotConfig) -> None:
         two_n = 2 * robot.joint.gear_ratio
         np.testing.assert_allclose((m1 - m2) / two_n, joints[0::2], atol=1e-12)
         np.testing.assert_allclose((m1 + m2) / two_n, joints[1::2], atol=1e-12)
-
-
-def test_power_is_the_same_at_motors_and_joints(robot: RobotConfig) -> None:
     world = world_of(robot)
     rng = np.random.default_rng(2)
     for _ in range(20):
@@ -123,9 +117,6 @@ def test_power_is_the_same_at_motors_and_joints(robot: RobotConfig) -> None:
         at_joints, at_motors = powers(world, rng.normal(size=12))
         assert at_joints == pytest.approx(at_motors, rel=1e-12)
         assert abs(at_motors) > 1e-3
-
-
-def test_both_motors_of_a_module_add_up_along_one_axis(robot: RobotConfig) -> None:
     world = world_of(robot)
     torque = np.zeros(12)
     torque[2:4] = 1.0  # both motors of the right knee
@@ -136,7 +127,9 @@ def test_both_motors_of_a_module_add_up_along_one_axis(robot: RobotConfig) -> No
     assert world.data.joint("knee_right_phi").qfrc_applied[0] == pytest.approx(0.0)
 
 
-def test_the_hoist_holds_an_unpowered_robot(robot: RobotConfig) -> None:
+def test_the_hoist_holds_an_unpowered_robot_which_falls_once_it_is_released(
+    robot: RobotConfig,
+) -> None:
     world = world_of(robot)
     run(world, 5.0)
     truth = seen(world)
@@ -145,9 +138,7 @@ def test_the_hoist_holds_an_unpowered_robot(robot: RobotConfig) -> None:
     assert truth.torso[2] == pytest.approx(robot.simulation.stand_height, abs=0.03)
     assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 0.01
     assert truth.feet_slip < 5e-3
-
-
-def test_an_unpowered_robot_falls_once_the_hoist_lets_go(robot: RobotConfig) -> None:
+    world = world_of(robot)
     world = world_of(robot)
     run(world, 0.5)
     world.release_hoist()
@@ -160,21 +151,7 @@ def test_an_unpowered_robot_falls_once_the_hoist_lets_go(robot: RobotConfig) -> 
     assert math.isfinite(truth.torso[2])
 
 
-def test_fallen_is_for_good(robot: RobotConfig) -> None:
-    world = world_of(robot)
-    upright = world.data.qpos.copy()
-    world.data.qpos[2] = 0.3
-    run(world, 0.002)
-    assert seen(world).fallen
-    world.data.qpos[:] = upright
-    world.data.qvel[:] = 0.0
-    run(world, 0.002)
-    truth = seen(world)
-    assert truth.torso[2] > 1.0
-    assert truth.fallen
-
-
-def test_a_push_moves_a_free_body_by_its_impulse(robot: RobotConfig) -> None:
+def test_a_push_moves_a_free_body_by_its_impulse_once_the_scenario_runs(robot: RobotConfig) -> None:
     """In the air, hoist gone: the momentum gained is the impulse, and no more after its end."""
     push = Push(at=0.02, duration=0.1, force=(40.0, -20.0, 10.0))
     world = world_of(robot, push=(push,))
@@ -187,6 +164,11 @@ def test_a_push_moves_a_free_body_by_its_impulse(robot: RobotConfig) -> None:
     one_step = 40.0 * world.timestep
     np.testing.assert_allclose(momentum[:2], (4.0, -2.0), atol=1.01 * one_step)
     assert momentum[2] == pytest.approx(1.0 - 74.58 * GRAVITY * 0.2, rel=0.01)
+    world = world_of(robot, push=(Push(at=0.0, duration=1.0, force=(500.0, 0.0, 0.0)),))
+    run(world, 0.05)
+    assert world.scenario_s < 0.0
+    assert world.outside.push == (0.0, 0.0, 0.0)
+    assert seen(world).push == (0.0, 0.0, 0.0)
 
 
 def _momentum(world: World) -> Array:
@@ -194,14 +176,6 @@ def _momentum(world: World) -> Array:
     before = world.data.subtree_com[0].copy()
     run(world, 0.002)
     return np.asarray(74.58 * (world.data.subtree_com[0] - before) / 0.002, float)
-
-
-def test_nothing_pushes_before_the_scenario_starts(robot: RobotConfig) -> None:
-    world = world_of(robot, push=(Push(at=0.0, duration=1.0, force=(500.0, 0.0, 0.0)),))
-    run(world, 0.05)
-    assert world.scenario_s < 0.0
-    assert world.outside.push == (0.0, 0.0, 0.0)
-    assert seen(world).push == (0.0, 0.0, 0.0)
 
 
 def test_the_hand_waits_for_the_hoist_and_keeps_within_its_strength(robot: RobotConfig) -> None:
@@ -289,7 +263,7 @@ def test_sideways_the_hand_pulls_the_harness_point_to_where_it_holds_it_against_
     assert abs(wanted) > 5.0
 
 
-def test_truth_is_finite_and_counts_up(robot: RobotConfig) -> None:
+def test_truth_counts_up_finite_and_a_fall_is_permanent(robot: RobotConfig) -> None:
     world = world_of(robot)
     world.start()
     for count in range(1, 6):
@@ -299,3 +273,14 @@ def test_truth_is_finite_and_counts_up(robot: RobotConfig) -> None:
         assert truth.scenario_s == pytest.approx(0.01 * count)
         for value in msgspec.structs.astuple(truth):
             assert np.all(np.isfinite(value))
+    world = world_of(robot)
+    upright = world.data.qpos.copy()
+    world.data.qpos[2] = 0.3
+    run(world, 0.002)
+    assert seen(world).fallen
+    world.data.qpos[:] = upright
+    world.data.qvel[:] = 0.0
+    run(world, 0.002)
+    truth = seen(world)
+    assert truth.torso[2] > 1.0
+    assert truth.fallen

@@ -10,17 +10,15 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import random
 import socket
-import ssl
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
@@ -29,6 +27,7 @@ from shared.bus.messages import RunEvent, RunEventKind
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig, expand
 from shared.joints import MODULES
+from tests.certified import identity, stranger
 
 PER_S: Final = 10_000
 HELD: Final = 500
@@ -37,33 +36,14 @@ STRANGER: Final = "127.0.0.66"
 CONNECTS_PER_S: Final = 640
 CONNECTS_MAX: Final = 60_000
 """Connections of one flood; it then ends by itself."""
-LARGE: Final = 200_000_000
 VICTIMS: Final = ("planner", *MODULES, "recorder")
 
 
 def link(robot: RobotConfig, run_dir: Path, name: str = "operator") -> zenoh.Session:
     """Link to every process of the fleet."""
-    settings: dict[str, Any] = {
-        "mode": "peer",
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "connect/endpoints": [expand(e, run_dir) for e in robot.bus.endpoints.values()],
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        "open/return_conditions/connect_scouted": False,
-    }
-    if robot.bus.security.mode == "mtls":
-        keys = Path(robot.bus.security.keys)
-        settings["transport/link/tls"] = {
-            "root_ca_certificate": str(keys / "authority.pem"),
-            "connect_certificate": str(keys / f"{name}.pem"),
-            "connect_private_key": str(keys / f"{name}.key"),
-            "enable_mtls": True,
-        }
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    endpoints = [expand(endpoint, run_dir) for endpoint in robot.bus.endpoints.values()]
+    secured = robot.bus.security.mode == "mtls"
+    return stranger(endpoints, identity(Path(robot.bus.security.keys), name) if secured else None)
 
 
 def steadily(work: Callable[[], object], per_s: int = PER_S) -> Iterator[None]:
@@ -109,18 +89,6 @@ def garbage(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
     yield from steadily(lambda: next(each).put(os.urandom(300)))
 
 
-def large(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """Put a huge message again and again."""
-    session = link(robot, run_dir)
-    publisher = session.declare_publisher(
-        f"xrl/{robot.name}/run/event", congestion_control=zenoh.CongestionControl.BLOCK
-    )
-    payload = bytes(LARGE)
-    while True:
-        publisher.put(payload)
-        yield
-
-
 def connect(endpoint: str, source: str = STRANGER) -> socket.socket:
     """Open a bare connection to an endpoint of the bus."""
     kind, _, rest = endpoint.partition("/")
@@ -149,37 +117,9 @@ def held(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
         yield
 
 
-def noise(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """Connect, say nonsense, and leave."""
-    endpoints = itertools.cycle(expand(robot.bus.endpoints[name], run_dir) for name in VICTIMS)
-    for endpoint in endpoints:
-        try:
-            with connect(endpoint) as one:
-                one.sendall(random.randbytes(2000))
-        except OSError:
-            pass
-        time.sleep(0.005)
-        yield
-
-
 def rubbish(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """As somebody at an allowed address: connect, say nonsense, and leave."""
-    yield from _from_allowed(robot, random.randbytes(500), held_max=0)
-
-
-def half(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """As somebody at an allowed address: begin a right handshake, and say nothing more."""
-    told = ssl.MemoryBIO()
-    hello = ssl.create_default_context().wrap_bio(ssl.MemoryBIO(), told, server_hostname="x")
-    try:
-        hello.do_handshake()
-    except ssl.SSLWantReadError:
-        yield from _from_allowed(robot, told.read(), held_max=HELD)
-
-
-def _from_allowed(robot: RobotConfig, said: bytes, held_max: int) -> Iterator[None]:
-    """Open `CONNECTS_PER_S` connections from the address that the fleet itself has."""
-    victims = [robot.bus.endpoints[name] for name in VICTIMS]
+    """As somebody at an allowed address, the fleet's own: connect, say nonsense, and leave."""
+    victims, said = [robot.bus.endpoints[name] for name in VICTIMS], random.randbytes(500)
     kept: deque[socket.socket] = deque()
     due = time.monotonic()
     for number in range(CONNECTS_MAX):
@@ -188,7 +128,7 @@ def _from_allowed(robot: RobotConfig, said: bytes, held_max: int) -> Iterator[No
         one.setblocking(False)
         one.connect_ex((address[0], int(address[2])))
         kept.append(one)
-        if len(kept) > 20 + held_max:
+        if len(kept) > 20:
             kept.popleft().close()
         if len(kept) > 10:
             with contextlib.suppress(OSError):  # refused: nothing listens there
@@ -198,10 +138,7 @@ def _from_allowed(robot: RobotConfig, said: bytes, held_max: int) -> Iterator[No
         yield
 
 
-KINDS: Final = {
-    "messages": messages, "garbage": garbage, "large": large, "held": held, "noise": noise,
-    "rubbish": rubbish, "half": half,
-}  # fmt: skip
+KINDS: Final = {"messages": messages, "garbage": garbage, "held": held, "rubbish": rubbish}
 
 
 def main() -> None:

@@ -1,28 +1,21 @@
 """Several hosts in one machine: network namespaces, a switch, and cables that can be pulled.
 
 Every namespace is anonymous: it is there for as long as a process is in it. Each of those made
-here is held open by a process whose input ends with this one, however that ends: a `cat` for
-a host, this module as a program for the switch. This process itself has to be started in a
-namespace of its own (`isolation`), which becomes the first of the hosts: the machine's own
-network is never touched.
+here is held open by a `cat` whose input ends with this process, however that ends; the switch has
+one of its own. This process itself has to be started in a namespace of its own (`isolation`), which
+becomes the first of the hosts: the machine's own network is never touched.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
-
-from pyroute2 import IPRoute
-from pyroute2.netlink.exceptions import NetlinkError
+from typing import Final, Self
 
 _SUBNET: Final = "10.0.0"
 _ENDING_S: Final = 10.0
@@ -43,8 +36,13 @@ def isolation() -> tuple[tuple[str, ...], str]:
 
     What they start may make namespaces itself, and change settings of its own network.
     """
-    if shutil.which("unshare") is None or shutil.which("nsenter") is None:
-        return (), "unshare and nsenter are not installed (package util-linux)"
+    for program, package in (
+        ("unshare", "util-linux"),
+        ("nsenter", "util-linux"),
+        ("ip", "iproute2"),
+    ):
+        if shutil.which(program) is None:
+            return (), f"{program} is not installed (package {package})"
     needed = f"unshare --net true && echo 1 > {_NONLOCAL_BIND}"
     refusals = []
     for words in _ISOLATIONS:
@@ -67,38 +65,36 @@ def processes_in(namespaces: Sequence[str]) -> set[int]:
     return found
 
 
-class Network:
+class Network(contextlib.ExitStack):
     """Hosts on one switch; use it in a `with` statement.
 
-    The first host is the namespace that this process is in.
+    The first host is the namespace that this process is in. Each namespace ends with the last
+    process in it.
     """
 
     def __init__(self, hosts: Sequence[str]) -> None:
         """Take the names of the hosts; at most 15 letters each, because they name interfaces."""
+        super().__init__()
         self._hosts = tuple(hosts)
         self._pids = {hosts[0]: os.getpid()}
-        self._switch: subprocess.Popen[str]
-        self._stack = contextlib.ExitStack()
+        self._switch = 0
 
     def __enter__(self) -> Self:
         """Make namespaces, switch and cables, all of them up."""
         with contextlib.ExitStack() as stack:
             for host in self._hosts[1:]:
-                self._pids[host] = stack.enter_context(_held("cat")).pid
-            command = (sys.executable, "-m", "tests.system.namespaces")
-            self._switch = stack.enter_context(_held(*command))
-            self._order(*(["join", h, self._pids[h], self.address(h)] for h in self._hosts))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self,
-        error_type: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Let go of the namespaces; each ends with the last process in it."""
-        self._stack.close()
+                self._pids[host] = stack.enter_context(_held())
+            self._switch = stack.enter_context(_held())
+            _ip(self._switch, "link", "add", _BRIDGE, "up", "type", "bridge")
+            for host, pid in self._pids.items():
+                peer = ("peer", "name", _CARD, "netns", str(pid))
+                _ip(self._switch, "link", "add", host, "type", "veth", *peer)
+                _ip(self._switch, "link", "set", host, "master", _BRIDGE, "up")
+                for card in ("lo", _CARD):
+                    _ip(pid, "link", "set", card, "up")
+                _ip(pid, "address", "add", f"{self.address(host)}/24", "dev", _CARD)
+            self.push(stack.pop_all())
+        return super().__enter__()
 
     def address(self, host: str) -> str:
         """Return a host's IPv4 address."""
@@ -111,7 +107,7 @@ class Network:
 
     def namespaces(self) -> list[str]:
         """Return every namespace as the kernel names it: the hosts' and the switch's."""
-        pids = (*self._pids.values(), self._switch.pid)
+        pids = (*self._pids.values(), self._switch)
         return [str(Path(_path(pid)).readlink()) for pid in pids]
 
     def allow_foreign_addresses(self) -> None:
@@ -123,35 +119,27 @@ class Network:
 
         The kernel takes up to a second to pass a carrier on that has come back.
         """
-        self._order(["set", host, "plugged", plugged])
+        _ip(self._switch, "link", "set", host, "up" if plugged else "down")
 
     def forward(self, host: str, *, forwarded: bool) -> None:
         """Have the switch lose every frame from and to a host, or none: no carrier tells of it."""
-        self._order(["set", host, "forwarded", forwarded])
-
-    def _order(self, *orders: list[object]) -> None:
-        """Have the switch carry out orders (`_obey`), and wait until it has."""
-        assert self._switch.stdin is not None
-        assert self._switch.stdout is not None
-        self._switch.stdin.write(json.dumps(orders) + "\n")
-        self._switch.stdin.flush()
-        answer = self._switch.stdout.readline()
-        assert answer == "null\n", f"the switch cannot do {orders}: {answer}"
+        port = ("master", _BRIDGE) if forwarded else ("nomaster",)
+        _ip(self._switch, "link", "set", host, *port)
 
 
 @contextlib.contextmanager
-def _held(*command: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a command in a network namespace of its own, until the end of its input."""
+def _held() -> Iterator[int]:
+    """Hold a network namespace open; yields the process that is in it."""
     with subprocess.Popen(
-        ["unshare", "--net", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ["unshare", "--net", "cat"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            process.stdin.write("[]\n")  # answered by what runs in the namespace
+            process.stdin.write("up\n")  # answered by what runs in the namespace
             process.stdin.flush()
-            assert process.stdout.readline(), f"{command} has failed; its message is above"
-            yield process
+            assert process.stdout.readline(), "unshare has failed; its message is above"
+            yield process.pid
         finally:
             process.stdin.close()
             try:
@@ -161,71 +149,12 @@ def _held(*command: str) -> Iterator[subprocess.Popen[str]]:
                 raise
 
 
+def _ip(pid: int, *words: str) -> None:
+    """Run `ip` in the namespace of a process."""
+    command = ["nsenter", f"--net={_path(pid)}", "ip", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
+
+
 def _path(pid: int) -> str:
     return f"/proc/{pid}/ns/net"
-
-
-class Switch:
-    """A bridge in this process's own namespace.
-
-    It speaks netlink by pyroute2, which forks to enter another namespace; so it is a small process
-    without threads and signal handlers. A line on its input is a list of orders in JSON, and is
-    answered by a line: `null`, or what was wrong. It ends at the end of its input.
-    """
-
-    def __init__(self, route: IPRoute) -> None:
-        self._route = route
-        route.link("add", ifname=_BRIDGE, kind="bridge")
-        self._bridge = _index(route, _BRIDGE)
-        route.link("set", index=self._bridge, state="up")
-
-    def join(self, host: str, pid: int, address: str) -> None:
-        """Lay a cable, a veth pair, to the namespace that a process is in."""
-        route = self._route
-        peer = {"ifname": _CARD, "net_ns_pid": pid}
-        route.link("add", ifname=host, kind="veth", peer=peer)
-        route.link("set", index=_index(route, host), master=self._bridge, state="up")
-        with IPRoute(netns=f"/proc/{pid}/ns/net") as inside:
-            for card in ("lo", _CARD):
-                inside.link("set", index=_index(inside, card), state="up")
-            inside.addr("add", index=_index(inside, _CARD), address=address, prefixlen=24)
-
-    def set_port(self, host: str, what: str, *, on: bool) -> None:
-        """Set whether a host's cable is plugged in, or whether its frames are forwarded."""
-        port = _index(self._route, host)
-        if what == "plugged":
-            self._route.link("set", index=port, state="up" if on else "down")
-        else:
-            self._route.link("set", index=port, master=self._bridge if on else 0)
-
-
-def _index(route: IPRoute, name: str) -> int:
-    (index,) = route.link_lookup(ifname=name)
-    return int(index)
-
-
-def _obey(switch: Switch, order: Sequence[Any]) -> None:
-    match order:
-        case ["join", host, pid, address]:
-            switch.join(host, pid, address)
-        case ["set", host, what, on]:
-            switch.set_port(host, what, on=on)
-
-
-def main() -> None:
-    """Be the switch until the end of the input."""
-    with IPRoute() as route:
-        switch = Switch(route)
-        for line in sys.stdin:
-            fault = None
-            try:
-                for order in json.loads(line):
-                    _obey(switch, order)
-            except NetlinkError as error:
-                fault = str(error)
-            sys.stdout.write(json.dumps(fault) + "\n")
-            sys.stdout.flush()
-
-
-if __name__ == "__main__":
-    main()

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -27,13 +25,10 @@ from shared.bus.messages import (
     Wrench,
 )
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.impairment import Impairer, Impairment
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Inject
 from shared.joints import MODULES
 from shared.links import DIRECTIONS
 from tests.system.fleets import leaving_nothing, xrl
-from tests.system.proxied import PERIOD_S, Proxied, proxied
 from tests.system.stalls import has_stalled, stalled_before_it_began, stood
 from tools.logs.run_log import read_run
 
@@ -60,9 +55,7 @@ BANDS = {
 """How far a live figure may be from lockstep's; live runs on two busy cores were within a third
 of these."""
 
-
 TRIES = 5
-
 
 NOT_HERE = (topics.ESTOP, topics.HARNESS_TARE, topics.LINK_EVENT, topics.OPERATOR_HAND)
 SUMMARY_KEYS = {
@@ -215,8 +208,8 @@ IMPAIRED = "all delay=8 jitter=4 loss=0.05 at=0.5 for=2"
 WHILE_IMPAIRED_S = (0.7, 2.5)
 QUANTILES_PCT = (25, 50, 75, 90)
 AGES_MS = 8.0
-"""How far a quantile of the ages may be from lockstep's: two periods of the planner. What jitter
-does is held much closer by test_on_the_wire_messages_are_as_late_as_in_the_modelled_network."""
+"""How far a quantile of the ages may be from lockstep's: two periods of the planner. The delays of
+single messages are equal (`tests/network_proxy/test_relay.py`)."""
 
 
 def ages_ms(out: Path) -> list[float]:
@@ -262,92 +255,3 @@ def test_live_and_lockstep_agree_on_a_bad_network(tmp_path: Path) -> None:
     assert np.abs(np.subtract(measured, modelled)).max() < AGES_MS, (measured, modelled)
     shares = [lost_share(run.out) for run in (lockstep, live)]
     assert shares == pytest.approx([0.05, 0.05], abs=0.015)
-
-
-# ---- the network alone: the network proxy between two sessions, against the object that decides
-
-NEAR = "hip_right"
-"""Nothing is done to this module's link; a stall of the machine meets it too."""
-COUNT = 800
-LATE_PCT = (10, 50, 90)
-LATE_MS = 2.5
-"""How far a quantile may be from the modelled one, on top of half of what the link beside scatters:
-1.4 of 4.6 measured on a busy machine, 2.7 of 5.6 with the proxy stopped 50 ms of each second."""
-SHARE = 0.06
-"""How far the share of the messages that come may be: the others are overtaken (0.03 measured)."""
-MODELLED = 30
-"""Seeds of the modelled network; one by itself scatters by 0.5 ms, and 0.015 of what comes."""
-
-JITTERS = {
-    "uniform": Impairment(delay_ms=20.0, jitter_ms=10.0),
-    "normal": Impairment(delay_ms=25.0, jitter_ms=8.0, distribution="normal"),
-    "pareto": Impairment(delay_ms=25.0, jitter_ms=12.0, distribution="pareto"),
-    "stream": Impairment(delay_ms=20.0, jitter_ms=15.0, ordered=True),
-}
-
-
-LATE = dict(zip(JITTERS, (name for name in MODULES if name != NEAR), strict=False))
-"""The module whose link the proxy makes late in this way; all of them at the same time."""
-
-
-@pytest.fixture(scope="module")
-def wire() -> Iterator[Proxied]:
-    with proxied(*LATE.values(), NEAR) as links:
-        for name, what in JITTERS.items():
-            link = f"{LATE[name]}->planner"
-            links.client.begin(Inject(link=link, at=0.0, **msgspec.to_builtins(what)))
-        links.send(COUNT, quiet_s=0.5)
-        links.client.clear("all")
-        yield links
-
-
-def modelled(what: Impairment, seed: int, sent_ns: list[int]) -> list[float]:
-    """Return how late the messages come, ms: none after one that was sent after it."""
-    impairer = Impairer(what, str(seed))
-    found, newest = list[float](), -1
-    releases = [(at, n) for n, t in enumerate(sent_ns) for at in impairer.passes(t, 500)]
-    for release_ns, number in sorted(releases):
-        if number > newest:
-            newest = number
-            found.append((release_ns - sent_ns[number]) / NS_PER_MS)
-    return found
-
-
-@pytest.mark.parametrize("name", JITTERS)
-def test_on_the_wire_messages_are_as_late_as_in_the_modelled_network(
-    name: str, wire: Proxied
-) -> None:
-    """Quantiles of many messages, relative to a link beside it to which nothing is done."""
-    what = JITTERS[name]
-    late, near = (np.array([ms for _, ms in wire.heard[m]]) for m in (LATE[name], NEAR))
-    assert len(near) > 0.9 * COUNT, "nothing is done to this link"
-    wanted = [modelled(what, seed, wire.sent_ns) for seed in range(MODELLED)]
-    pooled = np.concatenate(wanted)
-    besides = np.random.default_rng(1).choice(near, len(pooled))
-    quantiles = [np.percentile(rows, LATE_PCT) for rows in (late, pooled + besides)]
-    scatter_ms = float(np.ptp(np.percentile(near, (10, 90))))
-    apart = np.abs(quantiles[0] - quantiles[1]).max()
-    assert apart < LATE_MS + scatter_ms / 2, (quantiles, scatter_ms)
-    share = len(pooled) / (MODELLED * COUNT)
-    assert len(late) / len(near) == pytest.approx(share, abs=SHARE)
-
-
-@pytest.mark.parametrize(
-    ("name", "without"),
-    [
-        ("uniform", {"jitter_ms": 0.0}),
-        ("normal", {"distribution": "uniform"}),
-        ("pareto", {"distribution": "uniform"}),
-        ("stream", {"ordered": False}),
-    ],
-)
-def test_without_one_word_the_modelled_network_falls_outside_the_bands(
-    name: str, without: dict[str, object]
-) -> None:
-    """Else a network proxy that passes over the word would pass the test above."""
-    sent_ns = [n * round(PERIOD_S * NS_PER_S) for n in range(MODELLED * COUNT)]
-    what = JITTERS[name]
-    rows = [modelled(one, 1, sent_ns) for one in (what, msgspec.structs.replace(what, **without))]
-    quantiles = [np.percentile(one, LATE_PCT) for one in rows]
-    assert np.abs(quantiles[0] - quantiles[1]).max() > 1.5 * LATE_MS
-    assert abs(len(rows[0]) - len(rows[1])) > 1.5 * SHARE * len(sent_ns)

@@ -147,16 +147,6 @@ def test_the_last_line_says_what_ran_and_what_was_skipped_and_why(root: Path) ->
     assert last.endswith("; skipped: nothing")
 
 
-@pytest.mark.parametrize("words", [("no-such-revision",), ("HEAD", "more")])
-def test_a_change_since_what_is_no_revision_is_refused_and_nothing_runs(
-    root: Path, words: tuple[str, ...]
-) -> None:
-    code, said = run(root, "--changed", *words)
-    assert code == 2
-    assert "deploy/test: --changed " in said
-    assert "ruff called" not in said
-
-
 def test_who_reads_no_further_ends_it(root: Path) -> None:
     write_tool(root, "mypy", "sleep 0.5; yes | head -n 100000")
     script = start(root)

@@ -52,7 +52,6 @@ SAMPLE = [
     ("mtls", "held"),
     ("mtls", "rubbish"),
 ]
-"""The others of `flooder.KINDS` by hand: what was seen of them stands in docs/security.md."""
 
 
 @pytest.fixture(scope="module")

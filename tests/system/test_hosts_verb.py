@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 
-from services.joint.drivers.base import DriveStatus
 from shared.bus import topics
-from shared.bus.messages import Mode
+from shared.bus.messages import DriveStatus, Mode
 from shared.bus.topics import HOST_RECORDER
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig

@@ -1,4 +1,4 @@
-"""A fleet that leads: led for a fit, asked by a script, led by keys, in this order."""
+"""A fleet that leads: asked by a script, led by keys, in this order."""
 
 from __future__ import annotations
 
@@ -9,46 +9,23 @@ import select
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from shared.bus.messages import Mode
-from shared.bus.session import open_session
 from shared.clock import keep_pace
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Keyframe, Scenario
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from shared.run_directory import RUN_DIR_VARIABLE
 from tests.system.fleets import heard, wait_for, xrl
-from tests.system.stalls import has_stalled
-from tools.bringup.identify.body_lead import BodyLead, LeadRecord
-from tools.bringup.identify.quasi_static import moments_of
 
 pytestmark = [pytest.mark.system, pytest.mark.live, pytest.mark.timeout(240)]
 
 ROOT = DEFAULT_CONFIG.parents[1]
 SCRIPT = ROOT / "examples" / "send_intent.py"
-
-
-SHORT = Scenario(
-    "identify", "", 5.0,
-    (Keyframe(0.0, 1.188), Keyframe(2.5, 1.15, shift=(0.0, 0.02, 0.0, 0.0)), Keyframe(5.0, 1.188)),
-)  # fmt: skip
-TRIES = 3
-
-
-def undisturbed(go: Callable[[], LeadRecord]) -> LeadRecord:
-    """Return the record of a lead; repeat a lead that ended early because the machine stalled."""
-    for _ in range(TRIES):
-        began_ns = time.monotonic_ns()
-        found = go()
-        if not found.ended or not has_stalled(began_ns):
-            break
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -65,27 +42,6 @@ def place() -> Iterator[Path]:
             keep_pace(Path(path))
             down = xrl("down", run_dir=run_dir)
         assert down.returncode == 0, down.stderr
-
-
-def test_a_live_robot_is_led_for_a_fit_and_leads_on(place: Path, robot: RobotConfig) -> None:
-    with open_session(robot, "identify", place) as session:
-        led = undisturbed(
-            lambda: BodyLead(robot, session, simulated=True).go(
-                SHORT, lambda *_: None, lambda: False
-            )
-        )
-        assert led.ended == ""
-        moments = moments_of(led.states, led.wrenches)
-        assert len(moments.t_s) > 12
-        assert moments.q[:, 5].max() - moments.q[:, 5].min() > 0.05, "the hips went down"
-        body = BodyLead(robot, session, simulated=True)
-        stopped = body.go(SHORT, lambda *_: None, lambda: True)
-        assert stopped.ended == "stopped"
-        applied = xrl("drive", "identify", "body", "--apply", run_dir=place)
-        assert applied.returncode == 2
-        assert "runs with it" in applied.stderr, "and nothing was led"
-    status = xrl("status", run_dir=place)
-    assert "LEADING" in status.stdout
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A fleet of stand-ins under the real supervisor: nothing may be left behind, ever."""
+"""A fleet of stand-ins under the real supervisor: nothing is left behind, nor open to others."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import tempfile
@@ -23,7 +24,8 @@ from supervisor.states import ProcessStates
 
 from shared.exceptions import FleetError
 from shared.places import DEFAULT_CONFIG
-from tests.system.fleets import wait_for
+from shared.run_directory import live_dir
+from tests.system.fleets import command, wait_for
 from tests.tools.fleet.plans import robot_file
 from tests.waiting import comes_true
 from tools import cli
@@ -326,12 +328,15 @@ def test_a_start_without_room_says_so(
         start()
 
 
-def test_a_service_that_ends_at_once_fails_the_start_with_its_log(
+def test_a_service_that_ends_at_once_or_never_listens_fails_the_start(
     start: Start, run_dir: Path
 ) -> None:
     with pytest.raises(FleetError, match=r"planner ended at once \(exit status 3\)") as failure:
         start({"harness": SLEEPER, "planner": FAILING})
     assert "no drive on can0" in str(failure.value)
+    assert_nothing_left(run_dir, [])
+    with pytest.raises(FleetError, match="not up, and no progress for 2 s: planner"):
+        start({"planner": SLEEPER}, ready="endpoint", timeout_s=2.0)
     assert_nothing_left(run_dir, [])
 
 
@@ -358,12 +363,6 @@ def test_a_start_that_nobody_asked_for_ends_nothing_when_a_service_fails_and_sta
     assert (code, "planner is in a crash loop: it ended" in said) == (3, True), said
     assert "exit status 3: no drive on can0" in said
     assert "runs already" not in said
-
-
-def test_a_service_that_never_listens_fails_the_start(start: Start, run_dir: Path) -> None:
-    with pytest.raises(FleetError, match="not up, and no progress for 2 s: planner"):
-        start({"planner": SLEEPER}, ready="endpoint", timeout_s=2.0)
-    assert_nothing_left(run_dir, [])
 
 
 def test_a_start_that_goes_on_takes_as_long_as_the_machine_needs(start: Start) -> None:
@@ -485,3 +484,31 @@ def test_a_second_fleet_here_is_refused_and_the_first_is_killed_and_ended_by_ver
     assert wait_for(lambda: service(fleet, "planner").state == "suspended")
     assert order("down")[0] == 0
     assert_nothing_left(run_dir, pids)
+
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def test_a_fleet_that_was_started_with_umask_0_leaves_nothing_to_others(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    before = set(SHARED_MEMORY.iterdir())
+    out = tmp_path / "record"
+    only = ("--only", "ankle_right,simulator,recorder", "--scenario", "stand")
+    words = command("up", "--run-dir", run_dir, "--out", out, *only)
+    script = 'umask 0; exec "$@"'
+    try:
+        subprocess.run(["bash", "-c", script, "-", *words], check=True, timeout=90)
+        # "up" is a service that listens; what else it opens follows, on a busy machine later
+        opened = (live_dir(run_dir) / "ankle_right.rearm", live_dir(run_dir) / "joints.near")
+        assert wait_for(lambda: all(path.exists() for path in opened) and any(out.glob("*.mcap")))
+        folders = (run_dir, live_dir(run_dir))
+        found = [*folders, *(path for folder in folders for path in folder.rglob("*"))]
+        found += set(SHARED_MEMORY.iterdir()) - before
+        modes = {str(path): stat.S_IMODE(path.lstat().st_mode) for path in found}
+        assert {path.suffix for path in found} >= {".rearm", ".near", ".log"}
+        assert {path: oct(mode) for path, mode in modes.items() if mode & 0o077} == {}
+        (record,) = out.glob("*.mcap")
+        assert stat.S_IMODE(record.stat().st_mode) == 0o640
+    finally:
+        assert cli.main(["down", "--run-dir", str(run_dir)]) == 0

@@ -12,7 +12,7 @@ from shared.config.files import load_without_schedule
 from shared.extras import EXTRAS
 from shared.places import CHECKOUT, DEFAULT_CONFIG
 from tools import cli
-from tools.bringup import survey
+from tools.verbs import doctor
 
 
 @pytest.mark.parametrize(
@@ -26,15 +26,13 @@ from tools.bringup import survey
         ("log whatif OUT --kill planner", "sim"),
         ("bench", "sim"),
         ("bench fleet", "sim"),
-        ("drive tune x --sim", "sim"),
-        ("drive tune x", "plot"),
-        ("drive identify body OUT", "plot"),
-        ("drive identify joint --all", "plot"),
         ("gains", "design"),
         ("view", "view"),
         ("view OUT", "view"),
         ("view --sim", "sim"),
         ("view --foxglove", "foxglove"),
+        ("up --run-dir run --out o", "sim"),
+        ("up --run-dir run --out o --no-sim --ros2", "ros2"),
         ("up --view", "view"),
         ("log export OUT --gif a.gif", "plot"),
         ("log export OUT --ros2bag bag", "ros2"),
@@ -81,21 +79,6 @@ def test_a_verb_whose_package_cannot_be_imported_gives_the_packages_remedy_in_on
     assert [file.name for file in tmp_path.iterdir()] == ["mujoco"]
 
 
-@pytest.mark.parametrize(("flags", "extra"), [([], "sim"), (["--no-sim", "--ros2"], "ros2")])
-def test_up_starts_no_service_without_its_packages(
-    flags: list[str],
-    extra: str,
-    monkeypatch: pytest.MonkeyPatch,
-    run_dir: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setitem(sys.modules, EXTRAS[extra][0], None)
-    run = ["--run-dir", str(run_dir / "run"), "--out", str(run_dir / "out")]
-    assert cli.main(["up", *flags, *run]) == 2
-    assert f"the extra `{extra}` brings it" in capsys.readouterr().err
-    assert not (run_dir / "run").exists()
-
-
 def test_doctor_tells_in_a_row_that_no_settings_are_read_without_the_package_for_usb(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -104,6 +87,6 @@ def test_doctor_tells_in_a_row_that_no_settings_are_read_without_the_package_for
     file.write_text(text.replace('interface = "xrl_unix"', 'interface = "socketcan"'), "utf-8")
     robot = load_without_schedule(file)
     monkeypatch.setitem(sys.modules, "odrive", None)
-    (row,) = survey._Usb(robot, {}, services_up=False).rows(tmp_path)
+    (row,) = doctor._Usb(robot, {}, services_up=False).rows(tmp_path)
     assert row.found == "odrive is not installed"
     assert row.fix.startswith("the extra `usb` brings it: ")

@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.odrive_usb import OdriveUsb
+from shared.bus.messages import DriveStatus
 from shared.config.robot_config import RobotConfig
 from tests.usb import standin
 from tests.usb.standin import MODULE, Control, UsbRobot, eventually, serial_number

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from services.joint.drivers.base import Drive, DriveStatus, MotorTarget
+from services.joint.drivers.base import Drive, MotorTarget
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
 from services.simulator.fronts.fibre_port import FibreHub, FibrePort
 from services.simulator.fronts.usb_standin import build, load
+from shared.bus.messages import DriveStatus
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS
 from tests.waiting import comes_true as eventually

@@ -19,10 +19,6 @@ def plan(path: Path, *, simulation: bool) -> process_table.FleetPlan:
     return process_table.make_plan(path, Path("/tmp/xrl-t"), options)
 
 
-def test_the_shipped_robot_names_six_emulated_drives(robot: RobotConfig) -> None:
-    assert len({module.serial_number for module in robot.module}) == 6
-
-
 @pytest.mark.parametrize("driver", ["odrive_can", "odrive_usb"])
 @pytest.mark.parametrize(
     ("serial", "words"),
@@ -38,17 +34,18 @@ def test_a_wrong_serial_number_is_refused_whichever_the_driver(
         config_file.load(path)
 
 
-def test_a_missing_serial_number_is_refused_on_usb_only(tmp_path: Path) -> None:
+def test_a_serial_number_may_be_missing_only_without_usb_and_only_emulated_usb_has_the_stand_in(
+    tmp_path: Path, robot: RobotConfig
+) -> None:
     path = robot_file.write(tmp_path)
     path.write_text(path.read_text().replace('serial_number = "3A0000000004"\n', ""))
     with pytest.raises(ConfigError, match="ankle_left"):
         config_file.load(path)
     path.write_text(path.read_text().replace('"odrive_usb"', '"odrive_can"', 1))
     assert config_file.load(path).module_named("ankle_left").serial_number == ""
-
-
-def test_only_an_emulated_robot_on_usb_has_the_stand_in(tmp_path: Path) -> None:
+    path = robot_file.write(tmp_path)
     path = robot_file.write(tmp_path)
     assert plan(path, simulation=True).emulated_usb
     assert not plan(path, simulation=False).emulated_usb
     assert not plan(DEFAULT_CONFIG, simulation=True).emulated_usb
+    assert len({module.serial_number for module in robot.module}) == 6

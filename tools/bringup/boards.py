@@ -1,16 +1,27 @@
-"""What bring-up needs of an ODrive: settings by name, read and written; no matter over what."""
+"""An ODrive as bring-up sees it: settings by name, backed up, compared, written, read back."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import IntFlag
+from functools import partial
+from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
-from shared.can.cansimple import AxisError, ControllerError, EncoderError, MotorError
-from shared.can.drive_settings import AXES
+import msgspec
+from rich import box
+from rich.console import Group
+from rich.padding import Padding
+from rich.table import Column, Table
+from rich.text import Text
+
+from shared.atomic_file import atomic_file
+from shared.can.cansimple import AxisError, AxisState, ControllerError, EncoderError, MotorError
+from shared.can.drive_settings import AXES, WantedSetting, describe_value
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
+from shared.toml_file import read_text
 
 Value = bool | int | float | str | None
 """A value of any endpoint; text: the name of another endpoint, or none at all."""
@@ -40,6 +51,24 @@ STATUS: Final = (
     *(f"{axis}.{name}" for axis in AXES for name in _AXIS_STATUS),
 )
 """A board's state, besides its settings."""
+
+
+_NOT_JSON: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+"""Numbers that JSON does not have, as they stand in the file."""
+
+
+CALIBRATE: Final = "hang the leg, `xrl drive configure --apply --calibrate`"
+_CALIBRATED = {"motor.config.pre_calibrated": "motor.is_calibrated",
+               "encoder.config.pre_calibrated": "encoder.is_ready"}  # fmt: skip
+"""Settings that a drive takes only once it is calibrated."""
+_FOUND = (
+    "encoder.config.direction",
+    "encoder.config.phase_offset",
+    "encoder.config.phase_offset_float",
+)
+"""Results of the encoder's calibration with the present wiring. With other values the motor has no
+torque, or runs away.
+"""
 
 
 class Board(Protocol):
@@ -124,3 +153,186 @@ def number(values: Mapping[str, Value], name: str) -> float:
     if not isinstance(value, int | float):
         raise DriveError(f"no number at {name}; is this an ODrive v3 with firmware 0.5.x?")
     return value
+
+
+class BoardBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All settings of one board."""
+
+    module: str
+    serial_number: str
+    firmware: str
+    settings: dict[str, Value]
+    """By the firmware's names; inf, -inf and nan as text."""
+
+
+class Backup(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The file."""
+
+    time: str
+    """When it was made, ISO 8601, local time with its offset."""
+    robot_file: str
+    boards: tuple[BoardBackup, ...]
+
+
+def backup_of(module: str, board: Board) -> BoardBackup:
+    """Return a board's backup, with its numbers as JSON can have them."""
+    plain = {
+        name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in board.read(board.settings).items()
+    }
+    return BoardBackup(module, board.serial_number, describe_firmware(board.firmware), plain)
+
+
+def settings_of(backup: BoardBackup) -> dict[str, Value]:
+    """Return a backup's settings with their numbers as they were."""
+    return {
+        name: _NOT_JSON.get(value, value) if isinstance(value, str) else value
+        for name, value in backup.settings.items()
+    }
+
+
+def write_backup(path: Path, boards: Sequence[BoardBackup], *, time: str, robot_file: str) -> None:
+    """Write a backup; the file is whole or not there, and none is ever overwritten."""
+    backup = Backup(time=time, robot_file=robot_file, boards=tuple(boards))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path, exclusive=True, lasting=True) as file:
+            file.write(msgspec.json.format(msgspec.json.encode(backup)) + b"\n")
+    except OSError as error:
+        raise DriveError(
+            f"{path}: the backup cannot be written: {error.strerror}; nothing was changed"
+        ) from None
+
+
+def read_backup(path: Path) -> Backup:
+    """Read a backup."""
+    try:
+        return msgspec.json.decode(read_text(path), type=Backup)
+    except OSError as error:
+        raise DriveError(f"{path}: cannot be read: {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise DriveError(f"{path}: not a backup of `xrl drive configure`: {error}") from None
+
+
+class SettingChange(NamedTuple):
+    """One setting that is not as it should be."""
+
+    module: str
+    name: str
+    before: Value
+    after: Value
+    """As it should be written."""
+    why: str
+    inhibit: str
+    """Why it cannot be written; "" if it can."""
+    fits: Callable[[Value], bool]
+    """Returns True for a value that is as it should be."""
+
+
+class ChangeResult(NamedTuple):
+    """What came of a change."""
+
+    change: SettingChange
+    now: Value
+    """Read back after the restart."""
+    good: bool
+
+
+def changes_to_wanted(
+    module: str, wanted: Iterable[WantedSetting], board: Board
+) -> list[SettingChange]:
+    """Return what of a board is not as the robot wants it."""
+    settings = board.read(board.settings)
+    calibrated = board.read([f"{axis}.{name}" for axis in AXES for name in _CALIBRATED.values()])
+    changes = []
+    for row in wanted:
+        before, fits = settings.get(row.name), partial(_fits, row)
+        inhibit = "not there in this firmware; 0.5.6 has it"
+        if row.name in settings:
+            inhibit = _uncalibrated(row.name, calibrated)
+        if row.name not in settings or not fits(before):
+            changes.append(
+                SettingChange(module, row.name, before, row.value, row.why, inhibit, fits)
+            )
+    return changes
+
+
+def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> list[SettingChange]:
+    """Return what of a board is not as a backup has it."""
+    settings = board.read(board.settings)
+    changes = []
+    for name, value in saved.items():
+        before, fits, inhibit = settings.get(name), partial(equal, value), ""
+        if name not in settings:
+            inhibit = "not there in this board's firmware"
+        elif name.partition(".")[2] in _FOUND:
+            inhibit = "calibration finds it from the wiring of the phases; the board keeps its own"
+        if name not in settings or not fits(before):
+            changes.append(SettingChange(module, name, before, value, "", inhibit, fits))
+    return changes
+
+
+def refuse_armed(module: str, board: Board) -> None:
+    """Refuse a board one of whose axes is not idle: saving restarts it, and it lets go."""
+    for axis, state in zip(AXES, board.states(), strict=True):
+        if state != AxisState.IDLE:
+            known = state in AxisState.__members__.values()
+            words = AxisState(state).name if known else str(state)
+            raise DriveError(
+                f"{module}.{axis} is in {words}, not idle: saving restarts the board, and the "
+                "module goes limp. Hang the robot; `xrl down`, or switch its supply off and on"
+            )
+
+
+def write_changes(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
+    """Write a board's changes, save them, and read them back after the restart."""
+    to_write = sorted((change for change in changes if not change.inhibit), key=_watchdog_order)
+    if to_write:
+        board.write({change.name: change.after for change in to_write})
+        board.save()
+    now = board.read([change.name for change in changes])
+    return [
+        ChangeResult(c, now.get(c.name), c.name in now and c.fits(now[c.name])) for c in changes
+    ]
+
+
+def _watchdog_order(change: SettingChange) -> float:
+    """Return a change's rank: a watchdog is off before its timeout changes, and on after that."""
+    if not change.name.endswith(".config.enable_watchdog"):
+        return 0.0
+    return 1.0 if change.after else -1.0
+
+
+def describe_setting(value: Value) -> str:
+    """Return a setting's value as a person would write it."""
+    return "-" if value is None else describe_value(value)
+
+
+def difference_table(difference: Sequence[SettingChange]) -> Group:
+    """Return a difference for the terminal: a table, and below it why each is wanted."""
+    columns = (Column("module", no_wrap=True), Column("setting", no_wrap=True), "now", "new")
+    rows = Table(*columns, title="difference", title_justify="left", box=box.SIMPLE_HEAD)
+    reasons: dict[str, None] = {}
+    for change in difference:
+        head, _, tail = change.name.rpartition(".")
+        name = f"{head}.\n{tail}" if head else tail
+        values = map(describe_setting, (change.before, change.after))
+        rows.add_row(change.module, name, *values)
+        if change.why:
+            reasons[f"{tail}: {change.why}"] = None
+        if change.inhibit:
+            reasons[f"{change.module} {change.name} cannot be written: {change.inhibit}"] = None
+    return Group(rows, *(Padding(Text(reason), (0, 0, 0, 2), expand=False) for reason in reasons))
+
+
+def _fits(row: WantedSetting, value: Value) -> bool:
+    return isinstance(value, bool | int | float) and row.fits(value)
+
+
+def _uncalibrated(name: str, calibrated: Mapping[str, Value]) -> str:
+    """Return why a setting cannot be written yet: the drive takes it only when calibrated."""
+    axis, _, below = name.partition(".")
+    status = _CALIBRATED.get(below)
+    if status is None or calibrated.get(f"{axis}.{status}"):
+        return ""
+    return f"not calibrated: {CALIBRATE}"

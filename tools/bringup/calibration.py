@@ -1,4 +1,4 @@
-"""Leads a board's axes through the calibrations of their motors and encoders, and judges them.
+"""Leads boards of a hanging robot through the calibrations of motors and encoders, and judges them.
 
 A board is restarted before: errors are gone, and nothing has been connected. Its marks are written
 and saved once both axes are done. Whatever ends it before, another restart forgets what was
@@ -12,17 +12,26 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntFlag
+from functools import partial
+from pathlib import Path
 from typing import Final, NamedTuple
+
+from rich.status import Status
 
 from services.joint.differential import joint_from_motor
 from shared.bus.messages import Pair
 from shared.can.cansimple import AxisState, EncoderError, MotorError, OdriveError
 from shared.can.drive_settings import AXES
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import DriveError
-from tools.bringup.boards import AXIS_ERRORS, Board, Value, number
-from tools.bringup.check_board import describe_flags, trip_levels_of
-from tools.bringup.motion_runner import Interrupts
+from shared.exceptions import DECLINED_EXIT_CODE, FAULT_EXIT_CODE, DriveError
+from shared.joints import MODULES
+from tools.bringup import can_monitor, drive_access
+from tools.bringup.boards import AXIS_ERRORS, Board, FoundBoards, Value, number
+from tools.bringup.check_board import describe_flags, direction_rows, trip_levels_of
+from tools.bringup.findings import FindingKind
+from tools.bringup.hanging_leg import leg_of, why_resting
+from tools.bringup.motion_runner import NOT_IDLE, Interrupts
+from tools.terminal import Console, marked
 
 MOTOR_S: Final = 4.25
 """Resistance 3 s, inductance 1.25 s."""
@@ -44,6 +53,7 @@ POLES_WITHIN: Final = 0.04
 
 _ABSOLUTE: Final = 0x100
 """Bit of `encoder.config.mode`."""
+_DIRECTION: Final = "encoder.config.direction"
 _WATCHDOG: Final = "config.enable_watchdog"
 MARKS: Final = ("motor.config.pre_calibrated", "encoder.config.pre_calibrated")
 _READY: Final = ("motor.is_calibrated", "encoder.is_ready")
@@ -143,11 +153,7 @@ def scan_turns(values: Mapping[str, Value], axis: str) -> float:
 def refuse_unfit(
     module: str, board: Board, axes: Sequence[str], pause: Callable[[float], None] = time.sleep
 ) -> None:
-    """Refuse a board that cannot be calibrated as it is set up, or whose joint moves.
-
-    Raises:
-        DriveError: naming what, and what would be right.
-    """
+    """Refuse a board that cannot be calibrated as it is set up, or whose joint moves."""
     names = [f"{axis}.{name}" for axis in axes for name in _LOOK]
     levels = [f"config.dc_bus_{name}voltage_trip_level" for name in ("under", "over")]
     values = board.read([*names, *levels, "vbus_voltage"])
@@ -195,9 +201,9 @@ def calibrate_board(
         board: idle; it restarts before and after.
         axes: "axis0", "axis1" or both.
         interrupts: read all the time; one ends it, idles the axis and saves nothing.
-        progress: is told of the course.
+        progress: receives the axis, what it is at, and for how many seconds.
         clock: monotonic, s.
-        pause: waits so many seconds.
+        pause: waits a number of seconds.
     """
     board.restart()
     # a watchdog is fed over CAN only, and would end it
@@ -306,14 +312,8 @@ def _mismatch(board: Board, axis: str) -> str:
 
 
 def _found(board: Board, axis: str) -> Found:
-    names = [
-        f"{axis}.{name}"
-        for name in (
-            "motor.config.phase_resistance",
-            "motor.config.phase_inductance",
-            "encoder.config.direction",
-        )
-    ]
+    below = ("motor.config.phase_resistance", "motor.config.phase_inductance", _DIRECTION)
+    names = [f"{axis}.{name}" for name in below]
     values = board.read(names)
     ohm, henry, direction = (number(values, name) for name in names)
     return Found(ohm, henry, int(direction))
@@ -345,3 +345,138 @@ def _await_still(board: Board, pause: Callable[[float], None]) -> str:
         if moved <= STILL_TURNS:
             return ""
     return f"its motors move by themselves, {moved:.2f} turns in {STILL_S:g} s: hold it still"
+
+
+def to_calibrate(boards: Mapping[str, Board], *, again: bool) -> dict[str, tuple[str, ...]]:
+    """Return the axes to calibrate, by module: those that are not, or all."""
+    axes = {m: AXES if again else uncalibrated(board) for m, board in boards.items()}
+    return {module: those for module, those in axes.items() if those}
+
+
+def refuse_standing(
+    robot: RobotConfig, run_dir: Path, found: FoundBoards, axes: Mapping[str, Sequence[str]]
+) -> None:
+    """Refuse a robot that may bear weight: a drive is armed, or a limp leg rests on something.
+
+    Drives that are not on USB are listened to on CAN. A leg is judged where it has its zeros.
+    """
+    q: dict[str, Pair] = {}
+    for module in MODULES:
+        board = found.boards.get(robot.module_named(module).serial_number.upper())
+        if board is not None:
+            states: tuple[int, ...] = board.states()
+            angles = zeroed_angles(robot, module, board)
+            q |= {} if angles is None else {module: angles}
+        else:
+            states = can_states(robot, module, run_dir)
+        if AxisState.CLOSED_LOOP_CONTROL in states:
+            raise DriveError(
+                f"the drive of {module} is armed: the robot may stand on it. Hang the robot; "
+                "`xrl down`, or switch its supply off"
+            )
+    for module in axes:
+        leg = leg_of(module)
+        if all(each in q for each in leg) and (
+            why := why_resting(robot, {each: q[each] for each in leg})
+        ):
+            raise DriveError(f"{why}. Hang the robot with its feet clear of the floor")
+
+
+def can_states(robot: RobotConfig, module: str, run_dir: Path) -> tuple[int, ...]:
+    """Return the states of a module's axes by their heartbeats on CAN; none if nobody speaks."""
+    wiring = robot.module_named(module)
+    seconds = can_monitor.long_enough(robot.drive.heartbeat_period_ms)
+    bus = can_monitor.bus_config(robot, wiring.bus, run_dir)
+    nodes = can_monitor.listen(bus, wiring.node_ids, poll_nodes=False, seconds=seconds).nodes
+    beats = (nodes[node].heartbeat for node in wiring.node_ids)
+    return tuple(beat.axis_state for beat in beats if beat is not None)
+
+
+def calibrate(
+    console: Console,
+    robot: RobotConfig,
+    boards: Mapping[str, tuple[Board, Sequence[str]]],
+    interrupts: Interrupts,
+    *,
+    yes: bool,
+    check: Callable[[], None],
+) -> int:
+    """Ask and calibrate, one module after the other; return the exit code.
+
+    One that fails does not stop the others, unless it does not become idle.
+
+    Args:
+        console: to speak on.
+        robot: its file.
+        boards: by module, with the axes to calibrate.
+        interrupts: kept while an axis calibrates.
+        yes: do not ask.
+        check: raises an error if another program has the drives by now.
+    """
+    code, done = 0, list[str]()
+    for module, (board, those) in boards.items():
+        try:
+            refuse_unfit(module, board, those)
+            seconds = sum(p.seconds for axis in those for p in procedures(board, axis))
+            console.print(
+                f"\n{module}: {' and '.join(those)}, {seconds:.0f} s; each turns its motor by "
+                "about a turn and back, which moves phi and theta by 0.2 rad"
+            )
+            if not drive_access.confirm(
+                "Does its leg hang free, all hands off, the power switch at hand?", yes=yes
+            ):
+                console.print(f"{module} and what comes after it were not calibrated")
+                return DECLINED_EXIT_CODE
+            check()  # a person may take minutes to answer
+            with interrupts.kept(), console.status(module) as status:
+                result = calibrate_board(board, those, interrupts, partial(_show, status, module))
+        except DriveError as error:
+            console.print(marked("[bold red]{}[/]: {}", module, error))
+            console.print("what it was at ends by itself; switch its supply off and on after that")
+            code = FAULT_EXIT_CODE
+            continue
+        good = tell(console, robot, module, result)
+        code = code if good else FAULT_EXIT_CODE
+        done += [] if result.why else [module]
+        if interrupts.number or result.not_idle:
+            break
+    rest = [module for module in boards if module not in done]
+    if done:
+        console.print(
+            f"calibrated, and so without a zero: {', '.join(done)}; next `xrl drive zero`, "
+            "for each: MODULE --at PHI,THETA"
+        )
+    if rest:
+        console.print(f"not calibrated: {', '.join(rest)}")
+    return code
+
+
+def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult) -> bool:
+    """Print what came of a board's calibrations; return False if something is to be done."""
+    for axis, found in result.found.items():
+        console.print(
+            f"{module}.{axis}: {found.resistance:.3g} ohm, {1e6 * found.inductance:.3g} uH, "
+            f"direction {found.direction}"
+        )
+    if result.why:
+        console.print(marked("[bold red]{} was not calibrated[/]: {}", module, result.why))
+        if result.not_idle:
+            console.print(marked("[bold red]{}: {}[/]", module, NOT_IDLE))
+        else:
+            console.print(
+                "nothing of it was saved; the board has restarted with what it had, without a zero"
+            )
+        return False
+    values = {f"{axis}.encoder.is_ready": True for axis in result.found} | {
+        f"{axis}.{_DIRECTION}": each.direction for axis, each in result.found.items()
+    }
+    rows = direction_rows(module, values, robot)
+    wrong = [row for row in rows if row.verdict is FindingKind.WRONG]
+    for row in wrong:
+        words = "[bold red]{}[/]: direction is {}: {}"
+        console.print(marked(words, row.subject, row.found, row.fix))
+    return not wrong
+
+
+def _show(status: Status, module: str, axis: str, procedure: Procedure, passed_s: float) -> None:
+    status.update(f"{module}.{axis}: {procedure.what}, {passed_s:.1f} of {procedure.seconds:.1f} s")

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean, median
-from typing import Final, Generic, NamedTuple, TypeVar
+from typing import Final, Generic, TypeVar
 
 import can
 import msgspec
@@ -23,9 +23,7 @@ from shared.can import cansimple
 from shared.can.can_sensor import is_data_frame
 from shared.can.cansimple import Command, Heartbeat
 from shared.can.cansimple_06 import Command06, Version, unpack_version
-from shared.can.imu_can import IDS as IMU_IDS
-from shared.can.imu_can import ImuAssembler, ImuSample
-from shared.can.loadcell_can import FRAME_IDS, SampleAssembler
+from shared.can.sensor_frames import IMU_IDS, LOADCELL_IDS, ImuAssembler, ImuSample, SampleAssembler
 from shared.clock import keep_pace, machine_s, pace
 from shared.config.robot_config import RobotConfig, expand
 from shared.config.sections import CanConfig
@@ -33,8 +31,6 @@ from shared.exceptions import DriveError
 
 LISTEN_S: Final = 0.5
 LISTEN_MAX_S: Final = 3.0
-ANSWER_S: Final = 0.1
-"""An answer that takes longer is counted as lost."""
 HEARTBEATS: Final = 3.0
 """Periods of the heartbeat that are listened for, at least."""
 
@@ -42,8 +38,6 @@ QUESTIONS: Final = (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GE
 _WAIT_S = 0.05
 _FRAME_BYTES = 8
 _GAPS_MIN = 3
-_WAITING_MAX = 10_000
-"""More frames than any queue holds: a bus that never falls silent ends it."""
 
 
 class NodeTraffic(msgspec.Struct):
@@ -158,52 +152,6 @@ def _question(node: int, command: Command | Command06) -> can.Message:
     )  # fmt: skip
 
 
-class RoundTrips(NamedTuple):
-    """How long an axis takes to answer."""
-
-    times_ms: tuple[float, ...]
-    """Round trip of each answer, ms."""
-    lost: int
-    """Requests without an answer in `ANSWER_S`."""
-
-
-def round_trips(config: CanConfig, nodes: Sequence[int], count: int) -> dict[int, RoundTrips]:
-    """Ask axes for their supply's voltage `count` times; return how long each takes.
-
-    Not where services are up: any frame feeds a drive's watchdog.
-    """
-    times: dict[int, list[float]] = {node: [] for node in nodes}
-    try:
-        with _bus(config) as bus:
-            for _ in range(count):
-                for node in nodes:
-                    took_s = _asked(bus, node)
-                    if took_s is not None:
-                        times[node].append(1e3 * took_s)
-    except DriveError as error:
-        raise DriveError(f"{config.channel}: {error}") from None
-    return {node: RoundTrips(tuple(found), count - len(found)) for node, found in times.items()}
-
-
-def _asked(bus: can.BusABC, node: int) -> float | None:
-    """Ask an axis once; return the time until its answer, s, or None."""
-    question = _question(node, Command.GET_VBUS)
-    for _ in range(_WAITING_MAX):  # an answer that comes too late is none to the next request
-        if bus.recv(0.0) is None:
-            break
-    began = time.monotonic()
-    bus.send(question, timeout=_WAIT_S)
-    while (left := began + ANSWER_S - time.monotonic()) > 0.0:
-        message = bus.recv(left)
-        if message is None:
-            return None
-        # Whoever answers is the axis that was asked: by its id, and with a whole answer.
-        answers = is_data_frame(message) and len(message.data) == _FRAME_BYTES
-        if answers and message.arbitration_id == question.arbitration_id:
-            return time.monotonic() - began
-    return None
-
-
 def long_enough(heartbeat_period_ms: int) -> float:
     """Return how long to listen for heartbeats of this period, s."""
     return min(LISTEN_MAX_S, max(LISTEN_S, HEARTBEATS * 1e-3 * heartbeat_period_ms))
@@ -240,7 +188,7 @@ def _receive(
             traffic.error_frames += 1
         elif is_data_frame(message):
             traffic.frames += 1
-            if cells and message.arbitration_id in FRAME_IDS:
+            if cells and message.arbitration_id in LOADCELL_IDS:
                 _add(traffic.cells, assembler.add(message.arbitration_id, message.data), message)
             elif imu and message.arbitration_id in IMU_IDS:
                 _add(traffic.imu, orientation.add(message.arbitration_id, message.data), message)

@@ -12,7 +12,7 @@ from shared.config.robot_config import RobotConfig
 from tools.bringup.boards import describe_firmware
 from tools.bringup.can_monitor import BusTraffic, NodeTraffic, SensorTraffic, mean_ms, period_ms
 from tools.bringup.check_board import FIND_CAUSE, describe_flags, state_row
-from tools.bringup.check_socketcan import up_command
+from tools.bringup.check_host import up_command
 from tools.bringup.findings import Finding, advised, judged, warning, wrong
 from tools.fleet.process_table import SIMULATED_CAN
 
@@ -57,7 +57,7 @@ def harness_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
     if traffic.trouble:
         return [_closed(robot, subject, harness.bus, traffic)]
     if not cells.samples:
-        fix = "the amplifier's supply and wires; its frames are in shared/can/loadcell_can.py"
+        fix = "the amplifier's supply and wires; its frames are in shared/can/sensor_frames.py"
         why = "no assist force, no easing, no stop at overload"
         found, wanted = f"{traffic.frames} other frames", f"{harness.rate_hz:g} Hz"
         return [wrong(subject, what, found, wanted, fix, why)]
@@ -80,7 +80,7 @@ def imu_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
         return [_closed(robot, subject, imu.bus, traffic)]
     why = "the planner assumes a level floor"
     if not samples:
-        fix = "its supply and wires, its CAN output; its frames are in shared/can/imu_can.py"
+        fix = "its supply and wires, its CAN output; its frames are in shared/can/sensor_frames.py"
         found = f"{traffic.frames} frames that give no attitude"
         return [wrong(subject, what, found, f"{imu.rate_hz:g} Hz", fix, why)]
     known = sum(sample.valid for sample in samples)

@@ -33,7 +33,7 @@ class Finding(msgspec.Struct, frozen=True):
     """One finding."""
 
     subject: str
-    """Module, or "knee_left.axis0", or what else it is about."""
+    """Module, axis ("knee_left.axis0") or other part."""
     what: str
     found: str
     wanted: str
@@ -71,66 +71,51 @@ def ok(subject: str, what: str, found: str, wanted: str = "") -> Finding:
 
 def warning(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
     """Return a row that somebody should know of."""
-    return Finding(subject, what, found, wanted, FindingKind.WARNING, fix=fix, why=why)
+    return Finding(subject, what, found, wanted, FindingKind.WARNING, fix, why)
 
 
 def wrong(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
     """Return a row that keeps the robot in its hoist."""
-    return Finding(subject, what, found, wanted, FindingKind.WRONG, fix=fix, why=why)
+    return Finding(subject, what, found, wanted, FindingKind.WRONG, fix, why)
 
 
-def judged(
-    good: bool, subject: str, what: str, found: str, wanted: str, fix: str, why: str = ""
-) -> Finding:
-    """Return a row that is ok if it is good, else wrong."""
-    if good:
-        return ok(subject, what, found, wanted)
-    return wrong(subject, what, found, wanted, fix, why)
+def judged(good: bool, *row: str) -> Finding:
+    """Return a row that is ok if it is good, else wrong; the row is that of `wrong`."""
+    return ok(*row[:4]) if good else wrong(*row)
 
 
-def advised(
-    good: bool, subject: str, what: str, found: str, wanted: str, fix: str, why: str = ""
-) -> Finding:
-    """Return a row that is ok if it is good, else a warning."""
-    if good:
-        return ok(subject, what, found, wanted)
-    return warning(subject, what, found, wanted, fix, why)
+def advised(good: bool, *row: str) -> Finding:
+    """Return a row that is ok if it is good, else a warning; the row is that of `warning`."""
+    return ok(*row[:4]) if good else warning(*row)
 
 
 def merged(rows: Iterable[Finding]) -> list[Finding]:
-    """Return the rows with those on the same subject merged.
+    """Return the rows with those on the same matter merged.
 
     Rows that are ok become one, from the smallest to the largest value. Rows that are not ok merge
     where all six modules, all twelve axes, or both axes of a module are equal, so boards with
-    factory settings do not fill the table. Rows that are ok come first, in the order of the first
-    of each.
+    factory settings do not fill the table. Rows that are ok come first.
     """
-    alike: dict[str, list[Finding]] = {}
-    others: dict[tuple[str, ...], list[Finding]] = {}
+    alike: dict[tuple[str, ...], list[Finding]] = {}
     for row in rows:
-        if row.verdict is FindingKind.OK:
-            alike.setdefault(row.what, []).append(row)
+        is_ok = row.verdict is FindingKind.OK
+        matter = (row.what, row.wanted, row.verdict, row.why, _anywhere(row))
+        alike.setdefault((row.what,) if is_ok else matter, []).append(row)
+    good, bad = [], []
+    for group in alike.values():
+        subjects = {row.subject for row in group}
+        if group[0].verdict is FindingKind.OK:
+            good.append(_one(group, f"{ALL} {len(group)}"))
+        elif len(subjects) == len(group) and subjects in (_MODULES, _AXES):
+            all_alike = _one(group, f"{ALL} {len(group)}")
+            bad.append(msgspec.structs.replace(all_alike, fix=_anywhere(group[0])))
         else:
-            matter = (row.what, row.wanted, row.verdict, row.why, _anywhere(row))
-            others.setdefault(matter, []).append(row)
-    bad = [row for group in others.values() for row in _of_all_or_both_axes(group)]
-    return [_one(group) for group in alike.values()] + bad
-
-
-def _of_all_or_both_axes(group: list[Finding]) -> list[Finding]:
-    """Return as few rows as can stand for rows of one matter, none of which is ok."""
-    by_subject = {row.subject: row for row in group}
-    if len(by_subject) == len(group) and set(by_subject) in (_MODULES, _AXES):
-        return [msgspec.structs.replace(_one(group), fix=_anywhere(group[0]))]
-    together = []
-    for row in group:
-        module, _, axis = row.subject.partition(".")
-        both = [by_subject[name] for a in AXES if (name := f"{module}.{a}") in by_subject]
-        if axis not in AXES or len(both) != len(AXES):
-            together.append(row)
-        elif row is both[0]:
-            together.append(msgspec.structs.replace(_one(both), subject=f"{module}, both"))
-    return together
+            by_module: dict[str, list[Finding]] = {}
+            for row in group:
+                module, _, axis = row.subject.partition(".")
+                by_module.setdefault(module if axis in AXES else row.subject, []).append(row)
+            bad += [_one(both, f"{module}, both") for module, both in by_module.items()]
+    return good + bad
 
 
 def _anywhere(row: Finding) -> str:
@@ -139,7 +124,7 @@ def _anywhere(row: Finding) -> str:
     return row.fix.replace(f" --module {module}", "").replace(module, "MODULE")
 
 
-def _one(group: list[Finding]) -> Finding:
+def _one(group: list[Finding], subject: str) -> Finding:
     """Return the row that stands for rows of one matter: its values from least to largest."""
     first = group[0]
     if len(group) == 1:
@@ -147,12 +132,11 @@ def _one(group: list[Finding]) -> Finding:
     values = sorted({row.found for row in group}, key=_by_number)
     found = values[0] if len(values) == 1 else f"{values[0]} .. {values[-1]}"
     wanted = first.wanted if len({row.wanted for row in group}) == 1 else ""
-    subject = f"{ALL} {len(group)}"
     return msgspec.structs.replace(first, subject=subject, found=found, wanted=wanted)
 
 
 def _by_number(text: str) -> tuple[float, str]:
-    """Return what sorts "9 ms" before "10 ms"."""
+    """Return a sort key that puts "9 ms" before "10 ms"."""
     try:
         return float(text.partition(" ")[0]), text
     except ValueError:

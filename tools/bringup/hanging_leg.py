@@ -1,17 +1,23 @@
-"""A leg that hangs: a joint's inertia and gravity by the robot file, its place to move. Pure."""
+"""A leg that hangs: its joints' inertia and gravity, and which poses gravity explains. Pure.
+
+Written for the robot file's two equal masses of a leg, at knee and ankle; the hip's module is on
+the torso, and an ankle's mass lies in its axis.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.joint.torque_limiter import limits_of
+from services.joint.differential import limits_of
 from services.planner.law.model import HangingLegs
-from shared.bus.messages import Pair
-from shared.config.robot_config import RobotConfig
+from shared.arrays import Array
+from shared.bus.messages import Pair, Vector3
+from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULE_INDEX, MODULES, N_JOINTS, side_of
 
 INSIDE: Final = 0.12
@@ -22,6 +28,25 @@ RESTS_FROM: Final = 15.0
 """N m on a limp hip; 9 where the emulated robot hangs free, 22 where its soles are on the floor."""
 BIAS_TORQUE: Final = 1.3
 """Times what gravity takes at the bias, by the robot file."""
+
+
+FRICTION: Final = 1.0
+"""N m of dry friction and cogging that may hold a joint off its balance; the simulated robot has
+0.5. The thigh is short: a newton metre at hip and knee holds a knee 0.055 rad off."""
+KNEE_ERROR: Final = 0.03
+"""rad by which a knee hangs otherwise than by the robot file: 8 mm of its module's centre."""
+HIP_ERROR: Final = 0.02
+"""rad by which a leg's centre of mass is not where the file has it."""
+BEYOND: Final = 0.25
+"""rad beyond its limits that a joint may be found: they are where the software's stops begin."""
+STOP_FROM: Final = 0.05
+"""rad inside its limit from which a joint may rest on a mechanical stop."""
+TILT_MAX: Final = 0.35
+"""rad; a torso that hangs tilts no farther."""
+FOLDED: Final = 1.0
+"""rad; the thigh of a leg that hangs points down so far at least."""
+SWUNG: Final = 0.04
+"""rad to either side of its rest that a joint has to swing: a few times its friction's band."""
 
 
 def leg_of(*modules: str) -> tuple[str, ...]:
@@ -89,3 +114,105 @@ def _angles(q: Mapping[str, Pair]) -> NDArray[np.float64]:
         index = 2 * MODULE_INDEX[name]
         at[index : index + 2] = pair
     return at
+
+
+class Upright(NamedTuple):
+    """Which way is up, torso axes."""
+
+    up: Vector3
+    within: float
+    """How well it is known, rad; inf: not at all."""
+
+    @property
+    def is_known(self) -> bool:
+        """True if it is known at all."""
+        return math.isfinite(self.within)
+
+
+def leg_scores(robot: RobotConfig, q_knee: Array, q_hip: Array, upright: Upright) -> Array:
+    """Return how far gravity speaks against each pose of a leg (n, m): 1 is explained.
+
+    Args:
+        robot: masses, lengths and limits.
+        q_knee: (n, 2) phi and theta of its knee, rad.
+        q_hip: (m, 2) of its hip.
+        upright: which way is up; where that is not known, a torso that hangs.
+    """
+    allowed = TILT_MAX
+    if upright.is_known:
+        allowed = HIP_ERROR + FRICTION / _weight(robot) + upright.within
+    up = np.array(upright.up if upright.is_known else (0.0, 0.0, 1.0))
+    hips = angle(implied_up(robot, q_knee, q_hip), up) / allowed
+    return np.maximum(hips, _knee_scores(robot, q_knee)[:, None])
+
+
+def implied_up(robot: RobotConfig, q_knee: Array, q_hip: Array) -> Array:
+    """Return which way is up, torso axes (n, m, 3), if a leg's centre of mass is below its hip."""
+    up: Array = -np.einsum("hij,kj->khi", rotations(q_hip), _leg_down(robot, q_knee))
+    return up
+
+
+def angle(vectors: Array, other: Array) -> Array:
+    """Return the angles between unit vectors (..., 3) and one (3,), rad."""
+    across = np.linalg.norm(np.cross(vectors, other), axis=-1)
+    return np.asarray(np.arctan2(across, vectors @ other), float)
+
+
+def not_swung(swing: tuple[Pair, Pair], *, knee: bool) -> str:
+    """Return which way a joint has not swung; a knee may hang on its stop; "" if it has."""
+    (phi_low, theta_low), (phi_high, theta_high) = swing
+    sides = {
+        "phi, to its left": phi_low <= -SWUNG,
+        "phi, to its right": phi_high >= SWUNG,
+        "theta, backwards": theta_low <= -SWUNG,
+        "theta, forwards": knee or theta_high >= SWUNG,
+    }
+    return next((side for side, swung in sides.items() if not swung), "")
+
+
+def rotations(q: Array) -> Array:
+    """Return Ry(-theta) Rx(-phi) (n, 3, 3), which turns a link's axes into its parent's."""
+    phi, theta = q[:, 0], q[:, 1]
+    c, s, cp, sp = np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi)
+    zero = np.zeros(len(q))
+    rows = [[c, s * sp, -s * cp], [zero, cp, sp], [s, -c * sp, c * cp]]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _knee_scores(robot: RobotConfig, q: Array) -> Array:
+    """Score knees (n, 2) by the torque that friction or a stop has to hold: 1 is explained.
+
+    The thigh gives way as the knee bends, so that a third of the knee's angle is left to the shin.
+    """
+    down = _leg_down(robot, q)
+    l1, l2 = robot.geometry.l1, robot.geometry.l2
+    foot = -rotations(q)[:, :, 2]  # from the knee, in shins, thigh axes
+    theta = q[:, 1]
+    axis_phi = np.column_stack([-np.cos(theta), np.zeros(len(theta)), -np.sin(theta)])
+    arm = np.cross(foot, down)
+    pulls = np.column_stack([np.einsum("ij,ij->i", axis_phi, arm), -arm[:, 1]])
+    limit = robot.limits.knee
+    for axis, (low, high) in enumerate((limit.phi, limit.theta)):
+        pulls[(q[:, axis] > high - STOP_FROM) & (pulls[:, axis] > 0.0), axis] = 0.0
+        pulls[(q[:, axis] < low + STOP_FROM) & (pulls[:, axis] < 0.0), axis] = 0.0
+    allowed = KNEE_ERROR * 2.0 * l1 / (2.0 * l1 + l2) + FRICTION / _weight(robot)
+    allowed += FRICTION / (robot.mass.module * GRAVITY * l2)
+    scores = np.max(np.abs(pulls), axis=1) / allowed
+    scores[down[:, 2] > -math.cos(FOLDED)] = math.inf
+    return np.asarray(scores, float)
+
+
+def _weight(robot: RobotConfig) -> float:
+    """Return what a hanging leg's balance at its hip is worth, N m/rad."""
+    l1, l2 = robot.geometry.l1, robot.geometry.l2
+    return robot.mass.module * GRAVITY * (2.0 * l1 + l2)
+
+
+def _leg_down(robot: RobotConfig, q_knee: Array) -> Array:
+    """Return down in thigh axes (n, 3) for a leg that hangs from its hip with these knees (n, 2).
+
+    Two equal masses, a module at the knee and one at the ankle; the hip's is on the torso.
+    """
+    l1, l2 = robot.geometry.l1, robot.geometry.l2
+    moment = np.array([0.0, 0.0, -2.0 * l1]) - l2 * rotations(q_knee)[:, :, 2]
+    return np.asarray(moment / np.linalg.norm(moment, axis=1, keepdims=True), float)

@@ -13,11 +13,10 @@ from typing import Any, Final, Generic, NamedTuple, Protocol, TypeVar
 import msgspec
 
 from services.joint import pd_law
-from services.joint.differential import joint_from_motor
-from services.joint.drive_setpoint import DriveSetpointLaw
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.joint.torque_limiter import TorqueLimits, limit_torque, limits_of
-from shared.bus.messages import Pair
+from services.joint.differential import TorqueLimits, joint_from_motor, limit_torque, limits_of
+from services.joint.drive_setpoint import DriveGains, DriveSetpointLaw
+from services.joint.drivers.base import DriveReading, MotorTarget
+from shared.bus.messages import DriveStatus, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
@@ -231,6 +230,7 @@ class GuardedMotion:
         )
         self._gear_ratio = robot.joint.gear_ratio
         self._onboard = DriveSetpointLaw(robot.joint.gear_ratio, robot.drive.vel_limit)
+        self._gains = DriveGains()
         self._plan, self._q_start = plan, q
         self._start_ns = self._received_ns = now_ns
         self._at_limit_s: float | None = None
@@ -273,7 +273,7 @@ class GuardedMotion:
         if self.trouble:
             return None
         pos, vel = reading.pos_turns, reading.vel_turns
-        return self._onboard.target(now_ns, setpoint, self._tau, pos, vel)
+        return self._onboard.target(self._gains, now_ns, setpoint, self._tau, pos, vel)
 
     def _why_stop(self, t_s: float, q_ref: Pair, q: Pair) -> str:
         """Return what speaks against going on; "" if nothing does."""

@@ -33,7 +33,7 @@ from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.joints import KINDS, SIDES, kind_of, side_of
-from tools.bringup.free_leg import BEYOND, Upright, angle, implied_up, leg_scores, not_swung
+from tools.bringup.hanging_leg import BEYOND, Upright, angle, implied_up, leg_scores, not_swung
 
 CLEAR: Final = 1.5
 """Times what is explained that the second best pose must take."""

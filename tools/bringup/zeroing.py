@@ -1,4 +1,4 @@
-"""Writes a joint's position to its drive: observe, judge, write, read back.
+"""Writes a joint's position to its drive (look, judge, write, read back), and watches legs swing.
 
 Positions here are in the drive's own count; `services.joint.drivers.wired_drive` says why a motor
 at q = 0 gets a mark and not 0. The functions take a `Drive` without that wrapper: behind the mark
@@ -8,21 +8,24 @@ an armed drive that lost its zero would only look unzeroed.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 from services.joint.differential import joint_from_motor, motor_from_joint
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive
 from services.joint.drivers.wired_drive import MotorFrame
-from shared.bus.messages import LOST_DRIVE, Pair
+from shared.bus.messages import LOST_DRIVE, DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S, now_ns
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import DriveError
 from shared.joints import kind_of
-from tools.bringup.motion_runner import NO_ANSWER, await_reading
+from tools.bringup.hanging_leg import not_swung
+from tools.bringup.motion_runner import NO_ANSWER, STILL, STILL_FOR_S, await_reading
 
 LOOK_S: Final = 0.3
 """A joint is watched for so long before it is taken to be still."""
-STILL: Final = 0.05
+STILL_RATE: Final = 0.05
 """rad/s; an encoder count in a millisecond is 0.02 rad/s at the joint."""
 MOVED_MAX: Final = 0.005
 """rad in `LOOK_S`."""
@@ -38,6 +41,18 @@ SETTLED_S: Final = 0.1
 """s of reading before a position is written."""
 ATTEMPTS: Final = 4
 _READ_S: Final = 0.05
+
+
+HOW: Final = (
+    "push the foot of each leg forward and to its right, so that knee and hip move, and let go: "
+    "it has to swing back past where it rests by itself, and to come to rest"
+)
+WAIT_S: Final = 180.0
+PROGRESS_S: Final = 1.0
+_SWING_READ_S: Final = 0.005
+
+Swing = tuple[Pair, Pair]
+"""Lowest and highest (phi, theta), from where the joint rests, rad."""
 
 
 class Back(NamedTuple):
@@ -71,7 +86,7 @@ class DriveLook(NamedTuple):
     @property
     def is_moving(self) -> bool:
         """True if it moved while it was watched."""
-        return self.speed > STILL or self.moved > MOVED_MAX
+        return self.speed > STILL_RATE or self.moved > MOVED_MAX
 
 
 SILENT: Final = DriveLook(
@@ -171,3 +186,77 @@ def is_right(back: Back | None, q: Pair) -> bool:
         return False
     within = HELD_WITHIN if back.armed else WITHIN
     return all(abs(a - b) <= within for a, b in zip(back.q, q, strict=True))
+
+
+class _Track(NamedTuple):
+    """Where a joint has been, by the drive's own count, rad."""
+
+    now: Pair
+    low: Pair
+    high: Pair
+    still_at: Pair
+    still_since: float
+
+    def moved_to(self, q: Pair, now_s: float) -> _Track:
+        """Return the track with another position."""
+        low = (min(q[0], self.low[0]), min(q[1], self.low[1]))
+        high = (max(q[0], self.high[0]), max(q[1], self.high[1]))
+        if max(abs(q[0] - self.still_at[0]), abs(q[1] - self.still_at[1])) > STILL:
+            return _Track(q, low, high, q, now_s)
+        return _Track(q, low, high, self.still_at, self.still_since)
+
+    @property
+    def swing(self) -> Swing:
+        """What came of it, from where it is now."""
+        (a, b), (low_a, low_b), (high_a, high_b) = self.now, self.low, self.high
+        return (low_a - a, low_b - b), (high_a - a, high_b - b)
+
+
+def watch(
+    drives: Mapping[str, Drive],
+    gear_ratio: float,
+    progress: Callable[[str], None],
+    clock: Callable[[], float] = time.monotonic,
+) -> dict[str, Swing]:
+    """Return how knees and hips have swung once all have and rest again, or after `WAIT_S`.
+
+    Args:
+        drives: by module, idle, in their own counts.
+        gear_ratio: N of the differential.
+        progress: takes what is missing, once a second.
+        clock: s.
+
+    Raises:
+        DriveError: a drive has gone silent or is armed.
+    """
+    tracks: dict[str, _Track] = {}
+    begun, told = clock(), clock()
+    while clock() - begun < WAIT_S:
+        for module, drive in drives.items():
+            reading = drive.read(_SWING_READ_S)
+            if reading is None:
+                continue
+            if reading.status in (DriveStatus.LOST, DriveStatus.ARMED):
+                raise DriveError(f"{module}: {reading.status.name} while its leg swings")
+            q, now = joint_from_motor(reading.pos_turns, gear_ratio), clock()
+            track = tracks.get(module) or _Track(q, q, q, q, now)
+            tracks[module] = track.moved_to(q, now)
+        missing = _missing(tracks, clock())
+        if len(tracks) == len(drives) and not missing:
+            break
+        if clock() - told > PROGRESS_S and missing:
+            told = clock()
+            progress("; ".join(missing))
+    return {module: track.swing for module, track in tracks.items()}
+
+
+def _missing(tracks: Mapping[str, _Track], now_s: float) -> list[str]:
+    """Return which joints have not swung yet, or do not rest."""
+    found = []
+    for module, track in tracks.items():
+        side = not_swung(track.swing, knee=kind_of(module) == "knee")
+        if side:
+            found.append(f"{module}: {side}")
+        elif now_s - track.still_since < STILL_FOR_S:
+            found.append(f"{module}: not at rest")
+    return found

@@ -39,8 +39,6 @@ LINKED: Final = ("services", "shared", "tests", "tools", "deploy", "docs", "READ
 EXAMPLES: Final = """examples:
   ./deploy/mutants                      all groups; an hour on two cores
   ./deploy/mutants --group joint        one of them
-  ./deploy/mutants --only '*Failsafe*'  mutants by name
-  ./deploy/mutants --survivors          those that lived the last time
   ./deploy/mutants --resume             go on with what was stopped
 """
 
@@ -59,7 +57,7 @@ class Mutation(Section, frozen=True, order=True):
     """What a mutant is."""
 
     function: str
-    """As mutmut names it, such as `services.joint.torque_limiter.x_limit_torque`."""
+    """As mutmut names it, such as `services.joint.differential.x_limit_torque`."""
     was: str
     """The lines of code, stripped and joined by a space."""
     becomes: str
@@ -79,7 +77,7 @@ class MutantsFile(Section, frozen=True):
     reason: tuple[Reason, ...] = ()
 
 
-class GroupResult(NamedTuple):
+class _GroupResult(NamedTuple):
     """What became of a group."""
 
     counts: Counter[str]
@@ -118,9 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--group", action="append", help="only this group; may be repeated")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--only", metavar="PATTERN", help="only mutants whose name matches")
     which.add_argument("--sample", action="store_true", help="a fixed sample of the first group")
-    which.add_argument("--survivors", action="store_true", help="those that lived the last time")
     which.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
     parser.add_argument("--children", type=int, default=os.cpu_count(), help="processes")
     parser.add_argument(
@@ -129,27 +125,22 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(group: Group, args: argparse.Namespace, console: Console) -> GroupResult:
+def _run(group: Group, args: argparse.Namespace, console: Console) -> _GroupResult:
     folder = args.out.resolve() / group.name
-    patterns = [args.only] if args.only else [SAMPLE] if args.sample else []
-    if args.survivors:
-        patterns = [name for name, status in _statuses(folder) if status not in {*DEAD, UNTRIED}]
-        if not patterns:
-            raise RunError(f"group {group.name}: none lived the last time, or it never ran")
-    elif not args.resume and folder.exists():
+    if not args.resume and folder.exists():
         shutil.rmtree(folder)
     _prepare(group, folder)
     console.print(
         marked("[bold]{}[/]: {} modules; log: {}/run.log", group.name, len(group.modules), folder)
     )
-    _mutmut_run(folder, ["--max-children", str(args.children), *patterns], console)
+    _mutmut_run(folder, ["--max-children", str(args.children), *[SAMPLE] * args.sample])
     ran = [row for row in _statuses(folder) if row[1] != UNTRIED]
     alive = [
-        (name, change_of(name, _mutmut(folder, "show", name)))
+        (name, _change_of(name, _mutmut(folder, "show", name)))
         for name, status in ran
         if status not in DEAD
     ]
-    return GroupResult(Counter(status for _, status in ran), alive)
+    return _GroupResult(Counter(status for _, status in ran), alive)
 
 
 def _prepare(group: Group, folder: Path) -> None:
@@ -179,33 +170,24 @@ def _prepare(group: Group, folder: Path) -> None:
     (folder / "pyproject.toml").write_text(text, encoding="utf-8")
 
 
-def _mutmut_run(folder: Path, words: Sequence[str], console: Console) -> None:
-    """Run mutmut; its own words go into run.log, its count is shown."""
-    command = [sys.executable, "-m", "mutmut", "run", *words]
-    with (
-        (folder / "run.log").open("w", encoding="utf-8") as log,
-        subprocess.Popen(
-            command,
+def _mutmut_run(folder: Path, words: Sequence[str]) -> None:
+    """Run mutmut; its words go into run.log."""
+    with (folder / "run.log").open("w", encoding="utf-8") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mutmut", "run", *words],
             cwd=folder,
-            stdout=subprocess.PIPE,
+            stdout=log,
             stderr=subprocess.STDOUT,
-            text=True,
             start_new_session=True,  # with the processes of its own that it leaves behind
-        ) as process,
-        console.status("mutating, and running the tests as they are") as status,
-    ):
-        assert process.stdout is not None  # noqa: S101 - it is a pipe
+        )
         try:
-            for line in process.stdout:
-                log.write(line)
-                if "/" in line and "🎉" in line:
-                    status.update(line.strip())
+            status = process.wait()
         except BaseException:
             os.killpg(process.pid, signal.SIGKILL)
             raise
-    if process.returncode != 0:
+    if status != 0:
         last = (folder / "run.log").read_text(encoding="utf-8").strip().splitlines()[-3:]
-        raise RunError(f"mutmut ended with {process.returncode}: {' / '.join(last)}")
+        raise RunError(f"mutmut ended with {status}: {' / '.join(last)}")
 
 
 def _mutmut(folder: Path, *words: str) -> str:
@@ -225,7 +207,7 @@ def _statuses(folder: Path) -> list[tuple[str, str]]:
     return [(name, status) for name, _, status in pairs]
 
 
-def change_of(name: str, shown: str) -> Mutation:
+def _change_of(name: str, shown: str) -> Mutation:
     """Return what a mutant changes."""
     lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]
     was, becomes = (
@@ -235,19 +217,19 @@ def change_of(name: str, shown: str) -> Mutation:
 
 
 def _judge(
-    groups: Sequence[GroupResult], allowed: MutantsFile, args: argparse.Namespace, console: Console
+    groups: Sequence[_GroupResult], allowed: MutantsFile, args: argparse.Namespace, console: Console
 ) -> int:
     counts = sum((found.counts for found in groups), Counter[str]())
     total, dead = counts.total(), sum(counts[word] for word in DEAD)
     if not total:
-        raise RunError("no mutant has such a name")
+        raise RunError("no mutant was made")
     listed = {change for reason in allowed.reason for change in reason.lives}
     alive = [row for found in groups for row in found.alive]
     unlisted = [(name, change) for name, change in alive if change not in listed]
     for name, change in unlisted:
         console.print(f"lives: {name}", style="red")
         console.print(f"  - {change.was}\n  + {change.becomes}", markup=False, soft_wrap=True)
-    whole = not (args.only or args.sample or args.survivors or args.group)
+    whole = not (args.sample or args.group)
     stale = listed - {change for _, change in alive} if whole else set()
     for change in sorted(stale):
         text = f"listed, and does not live: {change.function}: {change.becomes}"
@@ -256,7 +238,7 @@ def _judge(
         f"{dead} of {total} mutants fail a test ({dead / total:.1%}); {len(alive)} live, "
         f"{len(alive) - len(unlisted)} of them for a reason in {FILE.relative_to(ROOT)}"
     )
-    low = dead < LEAST_SHARE * total and not (args.only or args.survivors)
+    low = dead < LEAST_SHARE * total
     if low:
         console.print(f"at least {LEAST_SHARE:.0%} are to fail one", style="red")
     return FAULT_EXIT_CODE if unlisted or stale or low else 0

@@ -20,10 +20,9 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from services.ros2_gateway.conversions import TIME_FIRST_NS, TIME_LAST_NS, Conversions
+from services.ros2_gateway.conversions import TIME_FIRST_NS, TIME_LAST_NS, Conversions, RosTypes
 from services.ros2_gateway.gateway import INPUTS, Gateway
 from services.ros2_gateway.rmw import RosTopic
-from services.ros2_gateway.ros_types import RosTypes
 from shared.bus.messages import Message
 from shared.bus.topics import Topic
 from shared.config.robot_config import RobotConfig

@@ -19,7 +19,7 @@ from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from shared.user import user_name
+from shared.places import user_name
 from tools.fleet import procfs
 
 REPEAT_S: Final = 0.05

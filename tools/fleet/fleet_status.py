@@ -6,7 +6,8 @@ import errno
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +15,8 @@ import msgspec
 
 from services.joint.rearm_guard import stop_source
 from shared import scheduling
+from shared.bus import security
+from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.messages import (
     LOST_DRIVE,
     Cause,
@@ -29,13 +32,18 @@ from shared.bus.messages import (
     ToolRoster,
     name_of,
 )
-from shared.bus.session import Latest, Session, place_of_tool
+from shared.bus.security import TCP
+from shared.bus.session import Latest, Session, peers_of, place_of_tool
+from shared.bus.sockets import Arrivals, addresses_of
+from shared.bus.tls_probe import own_fault, refusal
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
-from shared.exceptions import FleetError
+from shared.config.endpoints import host_and_port
+from shared.config.robot_config import SERVICES, RobotConfig
+from shared.exceptions import BusError, FleetError
 from shared.joints import MODULES
 from shared.robot.trip_table import reason_of, remedy_of
-from tools.fleet.bus_faults import BusFaults
+from tools.fleet import procfs
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.run_dir import SPACE_LOW_MIB, free_mib_at
 from tools.fleet.supervise import SupervisedFleet
@@ -59,20 +67,16 @@ _WINDOW_S: Final = 0.5
 _FRESH_S: Final = 1.0
 """An older message is history: its sender is dead, suspended or cut off."""
 _POLL_S: Final = 0.002
+_PROBES_AT_ONCE: Final = 16
 
 
-class ServiceStatus(msgspec.Struct, frozen=True):
+class ServiceStatus(ServiceInfo, frozen=True):
     """One service, by its supervisor and by its messages."""
 
-    pid: int | None
-    state: str
-    uptime_s: float
-    age_s: float | None
+    age_s: float | None = None
     """Age of its newest message; None if none has come, or it publishes none steadily."""
-    rate_hz: float | None
+    rate_hz: float | None = None
     """Its messages per second, by their sequence numbers; None as for `age_s`."""
-    restarts: int
-    last_exit: str
     real_time: bool | None = None
     """It has a real-time priority; None if it does not run, or is to have none."""
 
@@ -217,6 +221,69 @@ class RateMonitor:
         return (self.newest.seq - self._first.seq) * NS_PER_S / span_ns if span_ns > 0 else 0.0
 
 
+class BusFaults:
+    """Looks at the links that this host's services, and this tool, dial over TLS."""
+
+    def __init__(self, robot: RobotConfig, session: Session) -> None:
+        self._robot, self._session = robot, session
+        self.mode = robot.bus.security.mode
+        self._here = security.services_here(robot)
+        self._arrivals = Arrivals(security.ports_here(robot))
+        self.begin()
+
+    def begin(self) -> None:
+        """Count from here on."""
+        self._arrivals.flood(now_ns())
+
+    def describe(self, pids: dict[str, int]) -> tuple[str, ...]:
+        """Return what is wrong, in words; takes up to 2 s if a link does not come."""
+        if self.mode != "mtls":
+            return ()
+        flood = self._arrivals.flood(now_ns())
+        links = list(self._missing(pids))
+        with ThreadPoolExecutor(_PROBES_AT_ONCE) as pool:
+            found = pool.map(lambda link: refusal(link[1], link[3]), links)
+            refused = [
+                f"no link {dials} -> {peer} ({endpoint}): {why}"
+                for (dials, _, peer, endpoint), why in zip(links, found, strict=True)
+                if why
+            ]
+        return (*([flood] if flood else []), *self._own_faults(), *refused)
+
+    def _own_faults(self) -> Iterator[str]:
+        found: dict[str, list[str]] = {}
+        for name in sorted(self._here):
+            fault = own_fault(read_credentials(self._robot, name))
+            if fault:
+                found.setdefault(fault, []).append(name)
+        for fault, names in found.items():
+            yield f"no link over TLS: certificate of {', '.join(names)} {fault}"
+
+    def _missing(self, pids: dict[str, int]) -> Iterator[tuple[str, Credentials, str, str]]:
+        """Return who dials, as whom, which peer and where, for each link that is not there."""
+        alive = self._session.alive()
+        for dials, pid in (*pids.items(), (self._session.name, None)):
+            if pid is not None and dials not in SERVICES:
+                continue
+            linked = set() if pid is None else procfs.connected(pid)
+            for peer in peers_of(dials, self._robot.services):
+                endpoint = security.endpoint_here(self._robot, peer, self._here)
+                there = _is_in(endpoint, linked) if pid is not None else peer in alive
+                if there or not endpoint.startswith(TCP):
+                    continue
+                try:
+                    yield dials, read_credentials(self._robot, dials), peer, endpoint
+                except BusError:  # its own log tells
+                    break
+
+
+def _is_in(endpoint: str, linked: Collection[tuple[str, int]]) -> bool:
+    if not endpoint.startswith(TCP):
+        return True
+    host, port = host_and_port(endpoint)
+    return any((str(address), port) in linked for address in addresses_of(host))
+
+
 def monitors_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonitor]:
     """Return a monitor of each service that publishes steadily; modules may be on other hosts."""
     elsewhere = dict.fromkeys(MODULES, JOINT_STATE.name) | {
@@ -238,9 +305,9 @@ def listen_for_all(monitors: Mapping[str, RateMonitor]) -> None:
 
 
 def read_status(
-    fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str, bus: BusFaults
+    fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], bus: BusFaults
 ) -> FleetStatus:
-    """Listen for one window and return the fleet's status; `security` is `bus.security.mode`."""
+    """Listen for one window and return the fleet's status."""
     bus.begin()
     for monitor in monitors.values():
         monitor.new_window()
@@ -262,11 +329,11 @@ def read_status(
             for module in MODULES
             if module in monitors
         },
-        lead=lead_status(newest.get(PLANNER)),
+        lead=_lead_status(newest.get(PLANNER)),
         network=impairments(fleet),
         pace=pace(),
-        security=security,
-        tools=tools_of(roster),
+        security=bus.mode,
+        tools=_tools_of(roster),
         trouble=(*_trouble_of(fleet, infos), *recorder),
         bus_faults=bus.describe({row.name: row.pid for row in infos if row.pid is not None}),
     )
@@ -275,16 +342,8 @@ def read_status(
 def _service_status(
     info: ServiceInfo, age_s: float | None = None, rate_hz: float | None = None
 ) -> ServiceStatus:
-    return ServiceStatus(
-        pid=info.pid,
-        state=info.state,
-        uptime_s=info.uptime_s,
-        age_s=age_s,
-        rate_hz=rate_hz,
-        restarts=info.restarts,
-        last_exit=info.last_exit,
-        real_time=_real_time(info),
-    )
+    known = msgspec.structs.asdict(info)
+    return ServiceStatus(**known, age_s=age_s, rate_hz=rate_hz, real_time=_real_time(info))
 
 
 def _is_read_only(folder: Path) -> bool:
@@ -372,7 +431,7 @@ def module_status(
     )
 
 
-def lead_status(message: Message | None) -> LeadStatus | None:
+def _lead_status(message: Message | None) -> LeadStatus | None:
     """Return the planner's state from its newest status."""
     if not isinstance(message, PlannerStatus):
         return None
@@ -380,7 +439,7 @@ def lead_status(message: Message | None) -> LeadStatus | None:
     return LeadStatus(mode, message.wait_s, message.margin, reason_of(message), message.session)
 
 
-def tools_of(message: Message | None) -> tuple[str, ...]:
+def _tools_of(message: Message | None) -> tuple[str, ...]:
     """Return the tools that are linked, but for this process, from the recorder's newest roster."""
     own = f".{place_of_tool()}"
     if not isinstance(message, ToolRoster):

@@ -83,7 +83,7 @@ class Process(Section, frozen=True):
     """Topic that it publishes steadily, as in `shared.bus.topics`; empty if there is none."""
 
 
-class ProcessTable(Section, frozen=True):
+class _ProcessTable(Section, frozen=True):
     """The whole process table."""
 
     environment: dict[str, str]
@@ -182,7 +182,7 @@ def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetP
 
 
 def _selected(
-    table: ProcessTable, config: RobotConfig, options: FleetOptions
+    table: _ProcessTable, config: RobotConfig, options: FleetOptions
 ) -> tuple[Process, ...]:
     """Return the rows of a fleet; refuse a name that the table or this fleet does not have."""
     services, named = options.services or (), options.services is not None
@@ -207,9 +207,9 @@ def _selected(
     )
 
 
-def load_table(path: Path = TABLE) -> ProcessTable:
+def load_table(path: Path = TABLE) -> _ProcessTable:
     """Read the process table, with one row for each service: `{module}` rows are six."""
-    table = read_toml(path, ProcessTable)
+    table = read_toml(path, _ProcessTable)
     rows: list[Process] = []
     for index, row in enumerate(table.process):
         if not row.command:

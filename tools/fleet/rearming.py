@@ -17,12 +17,16 @@ from shared.bus.messages import DriveStatus, JointState, Mode, PlannerStatus, Wr
 from shared.bus.session import Session, open_session
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from tools.fleet.descent import HEARD_S, REST_RAD, REST_S
 from tools.fleet.supervise import SupervisedFleet
 
 PULL_MAX_N: Final = 40.0
 """Largest force on the harness, N, as of a hand that leads. A simulated hand that still pulled by
 150 N raised the robot by 0.37 m within 0.7 s of the re-arming."""
+HEARD_S: Final = 3.0
+"""Timeout for the first message of each module and of a planner, s."""
+REST_S: Final = 1.0
+REST_RAD: Final = 0.01
+"""A module that moves less than this in that time is at rest; rates are too noisy to tell."""
 READY_S: Final = 30.0
 """Timeout for all six modules to hold or track again, s."""
 _UNHEARD_S: Final = 0.5

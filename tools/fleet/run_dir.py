@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from services.harness import zero_file
+from services.harness.loop import zero_path
 from services.joint import neighbours, rearm_guard
 from services.joint.rearm_guard import LastState, RearmGuard
 from services.simulator.fronts import usb_standin
@@ -196,7 +196,7 @@ class RunDir:
             self._remove_logs()
             kept_state.forget_stops(self.path)
             # after a crash of the supervisor somebody may rest on the harness
-            zero_file.path_of(self.path).unlink(missing_ok=True)
+            zero_path(self.path).unlink(missing_ok=True)
         kept_state.restore(self.path)
         self.logs.mkdir(exist_ok=True)
         sockets = [item.endpoint for item in plan.listeners if item.endpoint.startswith(UNIX)]
@@ -257,7 +257,7 @@ class RunDir:
             _remove_socket(Path(path))
         _remove_socket(self.supervisor_socket)
         self._remove_shared_memory(keep_stops=keep_stops)
-        zero_file.path_of(self.path).unlink(missing_ok=True)
+        zero_path(self.path).unlink(missing_ok=True)
         for file in (self.supervisor_config, self.manifest, self.pace):
             file.unlink(missing_ok=True)
         if self.live != self.path:

@@ -26,7 +26,7 @@ _LABELS: Final = ("state", "last exit")
 _GOOD_STATES: Final = ("running", "starting")
 
 
-def describe_lead(lead: LeadStatus | None) -> str:
+def _describe_lead(lead: LeadStatus | None) -> str:
     """Return one line on the planner."""
     if lead is None:
         return "planner silent: each module holds by itself"
@@ -51,7 +51,7 @@ REMEDIES: Final = {
 """By the cause of a refusal: what it is likely to be, or what to do."""
 
 
-def describe_refusals(status: FleetStatus) -> list[str]:
+def _describe_refusals(status: FleetStatus) -> list[str]:
     """Return a line for each cause and sender of refused commands."""
     found = _gathered(
         ((row.cause, row.session), f"{name} {row.hz:.0f}/s")
@@ -65,7 +65,7 @@ def describe_refusals(status: FleetStatus) -> list[str]:
     ]
 
 
-def describe_ways_out(status: FleetStatus) -> list[str]:
+def _describe_ways_out(status: FleetStatus) -> list[str]:
     """Return a line for each way out of a state that a person must end, with its modules."""
     found = _gathered((module.way_out, name) for name, module in status.modules.items())
     return [
@@ -75,7 +75,7 @@ def describe_ways_out(status: FleetStatus) -> list[str]:
     ]
 
 
-def describe_stop(status: FleetStatus) -> list[str]:
+def _describe_stop(status: FleetStatus) -> list[str]:
     """Return a line for each source of an emergency stop that holds."""
     found = _gathered((module.stopped_by, name) for name, module in status.modules.items())
     return [
@@ -85,7 +85,7 @@ def describe_stop(status: FleetStatus) -> list[str]:
     ]
 
 
-def describe_sessions(status: FleetStatus) -> str:
+def _describe_sessions(status: FleetStatus) -> str:
     """Return what to say if the modules do not all follow the planner that is heard; else ""."""
     lead = status.lead.session if status.lead is not None else 0
     others = _gathered(
@@ -106,14 +106,14 @@ def _gathered(pairs: Iterable[tuple[K, str]]) -> dict[K, list[str]]:
     return found
 
 
-def describe_real_time(status: FleetStatus) -> str:
+def _describe_real_time(status: FleetStatus) -> str:
     """Return which services were refused a real-time priority; "" if none."""
     without = [name for name, row in status.services.items() if row.real_time is False]
     words = "without real-time priority, commands may come late (`xrl doctor` has the remedy)"
     return f"{words}: {', '.join(without)}" if without else ""
 
 
-def describe_tools(status: FleetStatus) -> str:
+def _describe_tools(status: FleetStatus) -> str:
     """Return the tools that are linked, for example "view on lab3, lead on pad"."""
     words = []
     for name in status.tools:
@@ -167,17 +167,17 @@ def _lines(status: FleetStatus) -> Iterator[str | Text]:
     impaired = f" [bold yellow]impaired on purpose: {{}}[/] (xrl {way_out})"
     slow = f"in slow motion: the fleet's clock goes at {status.pace:g} of real time"
     sections: tuple[tuple[str, Iterable[str]], ...] = (
-        (" {}", [describe_lead(status.lead)]),
-        (" [bold yellow]way out[/], {}", describe_ways_out(status)),
+        (" {}", [_describe_lead(status.lead)]),
+        (" [bold yellow]way out[/], {}", _describe_ways_out(status)),
         (red, [OPEN] if status.security == "open" else []),
         (red, status.bus_faults),
-        (yellow, describe_stop(status)),
+        (yellow, _describe_stop(status)),
         (" {}", [slow] if status.pace != 1.0 else []),
         (impaired, ["; ".join(status.network)]),
-        (yellow, describe_refusals(status)),
-        (" linked: {}", [describe_tools(status)]),
-        (" [dim]{}[/]", [describe_real_time(status)]),
-        (yellow, [describe_sessions(status)]),
+        (yellow, _describe_refusals(status)),
+        (" linked: {}", [_describe_tools(status)]),
+        (" [dim]{}[/]", [_describe_real_time(status)]),
+        (yellow, [_describe_sessions(status)]),
         (red, status.trouble),
     )
     for template, texts in sections:

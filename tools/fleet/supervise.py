@@ -336,7 +336,7 @@ class SupervisedFleet:
         }
         waiting = {row.name: row for row in plan.processes if row.autostart}
         watched = tuple(waiting)
-        watch = ProgressWatch(plan.options.timeout_s, self._used_s)
+        watch = _ProgressWatch(plan.options.timeout_s, self._used_s)
         while waiting:
             time.sleep(_POLL_S)
             for service in self._info_or_none():
@@ -378,7 +378,7 @@ class SupervisedFleet:
         return f"{service.name} ended at once ({how}); {log}:\n{words}".rstrip()
 
 
-class ProgressWatch:
+class _ProgressWatch:
     """Tells a start that is slow, on a busy machine, from one that does not go on.
 
     A service that comes up is progress, and so is processor time that the others use: their

@@ -156,7 +156,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
         }
 
 
-class FleetInterface:
+class _FleetInterface:
     """What `tools.fleet.supervisor_client` calls as `xrl.services` and `xrl.logs`."""
 
     def __init__(self, supervisor: Any) -> None:
@@ -172,9 +172,9 @@ class FleetInterface:
         return {"lost": LogFile.lost, "why": LogFile.why}
 
 
-def make_interface(supervisor: Any, **_settings: str) -> FleetInterface:
+def make_interface(supervisor: Any, **_settings: str) -> _FleetInterface:
     """Return the calls that `xrl` adds; supervisord's configuration names this function."""
-    return FleetInterface(supervisor)
+    return _FleetInterface(supervisor)
 
 
 class _Options(ServerOptions):  # type: ignore[misc]  # supervisor has no types

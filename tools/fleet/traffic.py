@@ -29,7 +29,7 @@ class _Numbering(msgspec.Struct, gc=False):
     seq: int
 
 
-class KeyTraffic:
+class _KeyTraffic:
     """The messages of one key in a window of time: `count`, and their `size`, bytes."""
 
     def __init__(self, key: TopicKey, *, here: bool = True) -> None:
@@ -93,7 +93,7 @@ class Traffic:
         self, session: Session, keys: Iterable[TopicKey], elsewhere: Collection[str] = ()
     ) -> None:
         self.keys = {
-            key.topic.key(session.robot, key.module): KeyTraffic(
+            key.topic.key(session.robot, key.module): _KeyTraffic(
                 key, here=not elsewhere or sender_of(key.topic, key.module) not in {"", *elsewhere}
             )
             for key in keys
@@ -125,7 +125,7 @@ def traffic_table(traffic: Traffic, window_s: float, *, only_seen: bool = False)
     return table
 
 
-def _cells(one: KeyTraffic, window_s: float) -> list[str]:
+def _cells(one: _KeyTraffic, window_s: float) -> list[str]:
     """Return rate and nominal rate, spacing and age (median, largest), size, flow and losses."""
     nominal = f"/{one.key.topic.rate_hz:g}" if one.key.topic.rate_hz else ""
     return [

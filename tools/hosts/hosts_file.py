@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -78,96 +79,95 @@ class Hosts(Section, frozen=True):
         return tuple(known[name] for name in names or known)
 
 
+Problems = Iterator[tuple[str, str, str]]
+"""Key, what is found there, and what would be right."""
+
+
 def load(path: Path, robot: RobotConfig) -> Hosts:
     """Read and check a hosts file against the robot that runs on them."""
     hosts = read_toml(path, Hosts)
-    _check(str(path), hosts, robot)
+    for key, found, right in _problems(hosts, robot):
+        raise ConfigError(str(path), key, found, right)
     return hosts
 
 
-def _check(file: str, hosts: Hosts, robot: RobotConfig) -> None:
-    services = real_services(robot)
-    homes: dict[str, str] = {}
+def _problems(hosts: Hosts, robot: RobotConfig) -> Problems:
     for index, host in enumerate(hosts.host):
-        where = f"host[{index}]"
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", host.name):
-            right = "letters, digits, _ and - only"
-            raise ConfigError(file, f"{where}.name", f"{host.name!r}", right)
-        _check_address(file, f"{where}.address", host.address)
-        if host.ssh.startswith("-") or not host.ssh.strip():
-            raise ConfigError(file, f"{where}.ssh", f"{host.ssh!r}", "as ssh takes it: user@host")
-        for key, value in (("name", host.name), ("address", host.address)):
-            if value in (getattr(other, key) for other in hosts.host[:index]):
-                raise ConfigError(file, f"{where}.{key}", f"{value!r} stands twice", "one each")
-        if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
-            found = f"{host.processors!r}"
-            raise ConfigError(file, f"{where}.processors", found, "as systemd takes them: 0-1,3")
-        _check_private(file, where, host)
-        if not host.services:
-            raise ConfigError(file, f"{where}.services", "none", "at least one")
-        for service in host.services:
-            if service not in services:
-                right = f"one of {', '.join(services)}"
-                raise ConfigError(file, f"{where}.services", f"no service {service!r}", right)
-            other = homes.setdefault(service, host.name)
-            if other != host.name or host.services.count(service) > 1:
-                raise ConfigError(
-                    file, f"{where}.services", f"{service!r} is {other}'s too", "once"
-                )
-        for tool in host.tools:
-            if tool not in _TOOLS:
-                right = f"one of {', '.join(_TOOLS)}"
-                raise ConfigError(file, f"{where}.tools", f"{tool!r}", right)
-    absent = [service for service in services if service not in homes]
+        for key, found, right in _of_host(host, hosts.host[:index], real_services(robot)):
+            yield f"host[{index}].{key}", found, right
+    homes = {service: host.name for host in hosts.host for service in host.services}
+    absent = [service for service in real_services(robot) if service not in homes]
     if absent:
-        raise ConfigError(file, "host", f"{', '.join(absent)} runs nowhere", "each on one host")
+        yield "host", f"{', '.join(absent)} runs nowhere", "each on one host"
     for side in SIDES:
-        leg = [module for module in MODULES if side_of(module) == side]
-        if len({homes[module] for module in leg}) > 1:
-            found = f"the {side} leg's services are on several hosts"
+        if len({homes.get(name) for name in MODULES if side_of(name) == side}) > 1:
             right = "one: they see each other's failures in shared memory (docs/hosts.md)"
-            raise ConfigError(file, "host", found, right)
+            yield "host", f"the {side} leg's services are on several hosts", right
     for index, address in enumerate(hosts.allow):
-        _check_address(file, f"allow[{index}]", address)
+        yield from _of_address(f"allow[{index}]", address)
     for key, value in (("checkout", hosts.checkout), ("folder", hosts.folder)):
         if not re.fullmatch(r"/[A-Za-z0-9_./-]+", value):
-            raise ConfigError(file, key, f"{value!r}", "an absolute path without spaces")
+            yield key, f"{value!r}", "an absolute path without spaces"
     if not re.fullmatch(r"[a-z_][a-z0-9_-]*", hosts.user):
-        raise ConfigError(file, "user", f"{hosts.user!r}", "a user's name")
+        yield "user", f"{hosts.user!r}", "a user's name"
 
 
-def _check_private(file: str, where: str, host: Host) -> None:
+def _of_host(host: Host, before: tuple[Host, ...], known: tuple[str, ...]) -> Problems:
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", host.name):
+        yield "name", f"{host.name!r}", "letters, digits, _ and - only"
+    yield from _of_address("address", host.address)
+    if host.ssh.startswith("-") or not host.ssh.strip():
+        yield "ssh", f"{host.ssh!r}", "as ssh takes it: user@host"
+    for key, value in (("name", host.name), ("address", host.address)):
+        if value in (getattr(other, key) for other in before):
+            yield key, f"{value!r} stands twice", "one each"
+    if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
+        yield "processors", f"{host.processors!r}", "as systemd takes them: 0-1,3"
+    yield from _of_private_network(host)
+    if not host.services:
+        yield "services", "none", "at least one"
+    for service in host.services:
+        other = next((other.name for other in before if service in other.services), host.name)
+        if service not in known:
+            yield "services", f"no service {service!r}", f"one of {', '.join(known)}"
+        if other != host.name or host.services.count(service) > 1:
+            yield "services", f"{service!r} is {other}'s too", "once"
+    for tool in host.tools:
+        if tool not in _TOOLS:
+            yield "tools", f"{tool!r}", f"one of {', '.join(_TOOLS)}"
+
+
+def _of_private_network(host: Host) -> Problems:
     for key, names in (("private", host.private), ("nic", (host.nic,) if host.nic else ())):
         for name in names:
             if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}", name):
-                right = "a network interface's name"
-                raise ConfigError(file, f"{where}.{key}", f"{name!r}", right)
+                yield key, f"{name!r}", "a network interface's name"
     if host.private and not host.nic:
         right = "the interface of the robot's network, on which the services get `address`"
-        raise ConfigError(file, f"{where}.nic", "missing beside `private`", right)
+        yield "nic", "missing beside `private`", right
+    if host.nic and not host.private:
+        right = "the CAN interfaces that only the services are to reach"
+        yield "private", "missing beside `nic`", right
     if len({*host.private, host.nic}) <= len(host.private):
-        right = "each interface once, and `nic` not among them"
-        raise ConfigError(file, f"{where}.private", ", ".join(host.private), right)
+        found = ", ".join(host.private)
+        yield "private", found, "each interface once, and `nic` not among them"
     most = ipaddress.ip_address(host.address).max_prefixlen
     least = 1 if most == _IPV4_BITS else _IPV4_BITS
     if host.private and not least <= host.prefix < most:
         right = f"{least} to {most - 1}: the length of the network's part of `address`"
-        raise ConfigError(file, f"{where}.prefix", str(host.prefix), right)
+        yield "prefix", str(host.prefix), right
     if host.private and host.ssh.rpartition("@")[2] == host.address:
-        right = "the host's own address: `address` is then the services'"
-        raise ConfigError(file, f"{where}.ssh", f"{host.ssh!r}", right)
-    if host.nic and not host.private:
-        right = "the CAN interfaces that only the services are to reach"
-        raise ConfigError(file, f"{where}.private", "missing beside `nic`", right)
+        yield "ssh", f"{host.ssh!r}", "the host's own address: `address` is then the services'"
 
 
-def _check_address(file: str, where: str, text: str) -> None:
+def _of_address(key: str, text: str) -> Problems:
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
-        raise ConfigError(file, where, f"{text!r}", "an IP address: names can be forged") from None
+        yield key, f"{text!r}", "an IP address: names can be forged"
+        return
     if address.is_unspecified or address.is_multicast:
-        raise ConfigError(file, where, f"{text!r}", "the address of one host")
+        yield key, f"{text!r}", "the address of one host"
 
 
 def real_services(robot: RobotConfig) -> tuple[str, ...]:

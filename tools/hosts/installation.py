@@ -14,13 +14,16 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tools.hosts.hosts_file import Host, Hosts, principals_on
 from tools.hosts.layout import (
+    FIREWALL,
     KEYS,
     LINK,
     NETWORK_UNIT,
+    NFT,
     ROBOT_FILE,
     RUN_DIR,
     SCHEDULE,
     UNIT,
+    firewall,
     network_unit,
     robot_on_hosts,
     unit,
@@ -66,6 +69,7 @@ def files_of(
     files = [
         HostFile(f"{folder}/{ROBOT_FILE}", config_file.to_toml(spread).encode()),
         HostFile(f"{folder}/{SCHEDULE}", schedule),
+        HostFile(f"{folder}/{FIREWALL}", firewall(spread).encode()),
         HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode()),
     ]
     if host.private:
@@ -139,15 +143,16 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
         own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{name}").out if name in wanted else ""
         if name in wanted and digest(own_unit.encode()) != wanted[name]:
             wrong.append(f"another {name}; `xrl hosts update`")
-    state = _state(remote)
+    state, warnings = _state(remote), list(probe.warnings)
     if remote.host.private and state not in _AT_REST:
         inside = remote.run("cat", "/proc/net/dev", on_bus=True).out
         outside = [n for n in (*remote.host.private, LINK) if f"{n}:" not in inside]
         if outside:
             wrong.append(f"not in the services' network: {', '.join(outside)} (docs/hosts.md)")
+    if state not in _AT_REST and remote.run(NFT, "list", "table", "inet", "xrl", on_bus=True).code:
+        warnings.append(f"no firewall at its ports: `nft -f {hosts.folder}/{FIREWALL}`")
     if not probe.revision:
         wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")
-    warnings = list(probe.warnings)
     if probe.revision.endswith("+"):
         warnings.append(f"{hosts.checkout} has changes of its own")
     return HostRow(

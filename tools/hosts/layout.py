@@ -1,4 +1,4 @@
-"""Each host's files: robot file and systemd units. Pure: text from text.
+"""Each host's files: robot file, firewall and systemd units. Pure: text from text.
 
 A host's services may have a network namespace of their own. A raw CAN socket needs no privilege, so
 whoever may log in to a host could idle a drive; CAN interfaces that are moved into the namespace
@@ -13,15 +13,18 @@ from typing import Final
 
 import msgspec
 
+from shared.config.endpoints import host_and_port
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import BusSecurityConfig
 from shared.joints import MODULES
-from tools.bringup.check_socketcan import setup_commands
+from shared.places import FILES
+from tools.bringup.check_host import setup_commands
 from tools.hosts.hosts_file import Host, Hosts, ports
 
 ROBOT_FILE: Final = "robot.toml"
 SCHEDULE: Final = "robot.gains.json"
 KEYS: Final = "keys"
+FIREWALL: Final = "xrl.nft"
 UNIT: Final = "xrl.service"
 NETWORK_UNIT: Final = "xrl-net.service"
 RUN_DIR: Final = "/var/lib/xrl/run"
@@ -35,6 +38,7 @@ NETWORK_PATH: Final = f"/run/netns/{NAMESPACE}"
 LINK: Final = "xrl0"
 """The services' interface on the robot's network."""
 IP: Final = "/sbin/ip"
+NFT: Final = "/usr/sbin/nft"
 
 _SIMULATOR_HOST: Final = "127.0.0.1"
 
@@ -64,6 +68,7 @@ def unit(hosts: Hosts, host: Host) -> str:
     capabilities = f"CapabilityBoundingSet={granted}"
     if granted:
         capabilities += f"\nAmbientCapabilities={granted}"
+    inside = f"{IP} netns exec {NAMESPACE} " if host.private else ""
     of_unit = of_service = ""
     if host.private:
         # Wants, not Requires: whoever stops that unit is not to idle the drives.
@@ -79,6 +84,8 @@ Wants=network-online.target
 [Service]
 Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
+# As root. The services start without it, too: strangers can only keep new links off.
+ExecStartPre=+-{inside}{NFT} -f {hosts.folder}/{FIREWALL}
 ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
   --run-dir {RUN_DIR} --only {",".join(host.processes)}
 ExecStop={xrl} down --limp --keep-stops --run-dir {RUN_DIR}
@@ -115,6 +122,24 @@ RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_CAN AF_NETLINK
 [Install]
 WantedBy=multi-user.target
 """
+
+
+def firewall(robot: RobotConfig) -> str:
+    """Return the rules by which only the robot's hosts and `allow` reach the services' ports."""
+    ends = [host_and_port(endpoint) for endpoint in robot.bus.endpoints.values()]
+    addresses = sorted({*(host for host, _ in ends), *robot.bus.security.allow})
+    elements = {
+        "ports": sorted({str(port) for _, port in ends}),
+        "hosts4": [address for address in addresses if ":" not in address],
+        "hosts6": [address for address in addresses if ":" in address],
+    }
+    lines = [
+        f"add element inet xrl {name} {{ {', '.join(found)} }}"
+        for name, found in elements.items()
+        if found
+    ]
+    rules = (FILES / "nftables" / FIREWALL).read_text(encoding="utf-8")
+    return "\n".join([rules.rstrip(), *lines, ""])
 
 
 def set_up_commands(host: Host) -> list[list[str]]:

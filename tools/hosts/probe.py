@@ -13,8 +13,7 @@ from typing import Final
 
 import msgspec
 
-from services.recorder.disk_guard import MIB
-from services.recorder.loop import free_bytes_at
+from services.recorder.host_watch import MIB, free_bytes_at
 from shared import scheduling
 from shared.arguments import FlagParser
 from shared.bus.credentials import NAMES, keys_folder
@@ -23,7 +22,7 @@ from shared.config import gain_schedule
 from shared.exceptions import XrlError
 from shared.places import CHECKOUT, IS_CHECKOUT
 from shared.revision import UNKNOWN, code
-from tools.bringup.check_machine import CLOCK_FIX, clock_is_synchronised
+from tools.bringup.check_host import CLOCK_FIX, clock_is_synchronised
 from tools.fleet.run_dir import SUPERVISOR_PID
 from tools.keys.authority import held_files
 from tools.keys.inspection import inspect_keys

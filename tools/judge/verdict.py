@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from services.planner.law.shift import ROWS
+from services.planner.law.closed_reference import ROWS
 from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import JointEvent, JointState, Mode, PlannerStatus, RunEvent, RunEventKind

@@ -25,7 +25,7 @@ from shared.bus.security import common_name
 from shared.bus.topics import PRINCIPALS
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError
-from shared.user import in_home
+from shared.places import in_home
 from tools.keys import certificates
 from tools.keys.certificates import Issued
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TypeVar
 
-from services.planner.controller_file import ATTACHED, absolute, split_spec
+from services.planner.controller import ATTACHED, absolute, split_spec
 from services.simulator.physics.plant import PlantConfig
 from shared.atomic_file import replace_file
 from shared.bus.session import Session, open_session

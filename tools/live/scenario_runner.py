@@ -35,7 +35,6 @@ from tools.fleet.pace import IDLE_LEAST, PACE_MIN, CoresFullError, idle_and_tota
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.stalls import STALL_SHOWN_NS, Stall, StallWatch
 from tools.fleet.supervise import SupervisedFleet
-from tools.live.planner_return import PlannerReturn
 
 READY_TIMEOUT_S: Final = 45.0
 """Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
@@ -54,6 +53,7 @@ POLL_S: Final = 0.004
 UNHEARD_S: Final = 0.5
 """A module that says nothing for so long is shown as silent."""
 PIDS_EVERY_S: Final = 1.0
+STARTING: Final = "waiting for six modules to track"
 FULL_CORE: Final = 0.2
 """With less idle time beside the fleet one of two cores may be full; of four it fills none."""
 ENDING_S: Final = 3.0
@@ -187,7 +187,7 @@ class ScenarioRunner:
         self._states = {
             module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
         }
-        self._planner = PlannerReturn(session.latest(topics.PLANNER_STATUS, PlannerStatus))
+        self._planner: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._control = session.publisher(topics.SIM_CONTROL, SimControl)
         self._truth: SimTruth | None = None
         self._truth_at_s = time.monotonic()
@@ -196,9 +196,8 @@ class ScenarioRunner:
         self._note = ""
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
-        self._watch = StallWatch()
-        self._stalls: list[Stall] = []
-        self._killed = self._is_standing = False
+        self._stalls = StallWatch()
+        self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
         """Wait until the robot stands, run the scenario to its end, or until `is_over`.
@@ -208,7 +207,7 @@ class ScenarioRunner:
             RunError: the robot did not come to stand, or the simulated world went silent.
             FleetError: a service that was to be restarted could not be.
         """
-        with self._watch:
+        with self._stalls:
             return self._run(is_over)
 
     @property
@@ -274,7 +273,7 @@ class ScenarioRunner:
         begin_s = time.monotonic()
         deadline, look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s + PATIENCE_S
         since = before = None
-        self._note = "waiting for six modules to track"
+        self._note = STARTING
         while since is None or time.monotonic() - since < machine_s(SETTLE_S):
             self._listen()
             if is_over():
@@ -284,7 +283,6 @@ class ScenarioRunner:
             if self._truth is not None and self._truth.fallen:
                 return False
             if all(tracking) and standing:
-                self._is_standing = True
                 if since is None:
                     since, before = time.monotonic(), idle_and_total()
                 self._note = "standing, settling"
@@ -295,7 +293,7 @@ class ScenarioRunner:
                         self._check_cores(idle_share(before))
                     before, look_s = idle_and_total(), time.monotonic() + PATIENCE_S
             if time.monotonic() > deadline:
-                lead = self._planner.latest.take()
+                lead = self._planner.take()
                 raise RunError(
                     f"not all six modules track after {READY_TIMEOUT_S:.0f} s: "
                     f"{(lead.why if lead else '') or self._describe_modes()}; "
@@ -353,28 +351,23 @@ class ScenarioRunner:
                 name_of(Mode, self._modes[module])[0] if module in self._modes else "-"
                 for module in MODULES
             )
-            words = (
-                self._note,
-                self._planner.waits(truth, self._modes.values()),
-                self._stall_words(),
-            )
-            note = "; ".join(word for word in words if word)
+            note = "; ".join(word for word in (self._note, self._stall_words()) if word)
             self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
-        stalls = self._watch.take()
-        if self._is_standing:  # services that start take the machine's time
+        stalls = self._stalls.take()
+        if self._note != STARTING:  # services that start take the machine's time
             self._events.tell(stalls)
-            self._stalls += stalls
 
     def _stall_words(self) -> str:
         """Return what to show of the newest stall; empty if it was a while ago."""
-        if not self._stalls or now_ns() - self._stalls[-1].end_ns > STALL_SHOWN_NS:
+        newest = self._stalls.newest
+        if newest is None or now_ns() - newest.end_ns > STALL_SHOWN_NS:
             return ""
         held = list(self._modes.values()).count(Mode.HOLD)
         who = "all six" if held == len(MODULES) else held
         by_it = f": {who} hold" if held and not self._killed else ""
-        return f"{self._stalls[-1].words}{by_it}"
+        return f"{newest.words}{by_it}"
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
         """Do what is due; the simulator does pushes and faults, and they are only recorded here."""
@@ -394,8 +387,6 @@ class ScenarioRunner:
             self._fleet.start_service(row.service)
             self._next_pids_s = 0.0
             self._note = f"{row.service} back"
-            if row.service == "planner":
-                self._planner.start(self._truth)
         elif isinstance(row, Inject):
             ProxyClient(self._fleet.run.path).begin(row)
         elif isinstance(row, Fault):

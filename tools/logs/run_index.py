@@ -22,7 +22,7 @@ from shared.mcap_log.files import SUFFIX
 from shared.mcap_log.reader import ChunkPlace, LogRecord, LostBytes, open_log
 from shared.mcap_log.records import Attachment, Channel, Metadata
 from shared.mcap_log.writer import SCHEMA_VERSION
-from shared.text_file import decoded
+from shared.toml_file import decoded
 
 THIS_HOST: Final = "this host"
 """Name of the host of services whose endpoint is a socket in the file system."""

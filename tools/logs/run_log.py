@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from services.planner.controller_file import ATTACHED
+from services.planner.controller import ATTACHED
 from shared.bus import topics
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -29,7 +29,7 @@ from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
-from shared.text_file import decoded
+from shared.toml_file import decoded
 from tools.logs.run_index import RunIndex
 from tools.topic_keys import sender_of
 

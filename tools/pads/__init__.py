@@ -1,1 +1,1 @@
-"""Gamepads: what their axes and buttons mean, and where a person leads by them."""
+"""Leading by a gamepad or by keys: the pad's state, and where its deflections lead."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from services.simulator.physics.led_hand import HEIGHTS, PITCHES
+from services.simulator.physics.operator import HEIGHTS, PITCHES
 from shared.clamp import clamp
 
 HEIGHT_RATE: Final = 0.15
@@ -18,7 +18,7 @@ DEAD_ZONE: Final = 0.2
 
 
 class Deflection(NamedTuple):
-    """What a person does now, each from -1 to 1."""
+    """Deflections of the sticks, each from -1 to 1."""
 
     height: float = 0.0
     pitch: float = 0.0
@@ -26,7 +26,7 @@ class Deflection(NamedTuple):
 
 
 class Led(NamedTuple):
-    """Where it leads."""
+    """Position of the hand and request for assist."""
 
     height: float
     """m"""
@@ -36,18 +36,18 @@ class Led(NamedTuple):
 
 
 class Pilot:
-    """Integrates deflections, while they are meant; `led` is where it leads now."""
+    """Integrates deflections; `led` is the result."""
 
     def __init__(self, height: float, pitch: float, assist_max_n: float) -> None:
         self._assist_max_n = assist_max_n
         self.led = Led(clamp(height, *HEIGHTS), clamp(pitch, *PITCHES), 0.0)
 
-    def keep_assist(self, given_n: float) -> None:
-        """Ask for no more assist than is given now, N."""
+    def limit_assist(self, given_n: float) -> None:
+        """Reduce the request to the assist that the planner gives now, N."""
         self.led = self.led._replace(assist_n=max(0.0, min(self.led.assist_n, given_n)))
 
     def integrate(self, wanted: Deflection, dt: float) -> Led:
-        """Go on by dt, s."""
+        """Integrate deflections over dt, s."""
         height, pitch, assist_n = self.led
         self.led = Led(
             clamp(height + HEIGHT_RATE * _beyond(wanted.height) * dt, *HEIGHTS),

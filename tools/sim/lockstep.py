@@ -8,44 +8,47 @@ process, clock or bus: two runs with one seed are equal to the last bit.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Final
 
 import msgspec
 
-from services.joint.controller import JointController
+from services.joint.controller import ControllerState
 from services.joint.drive_manager import DriveManager, DriveManagerState
+from services.joint.heat import report
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner, PlannerState
-from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fault_injector import FaultInjector
-from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import PlantConfig
-from services.simulator.physics.world import World
-from services.simulator.state import read_state, write_state
+from services.simulator.physics.plant import to_toml as plant_to_toml
+from services.simulator.robot import SimulatedRobot, axes_by_bus
 from shared.bus import topics
 from shared.bus.messages import HandLead, JointEvent, Message, Mode, RunEvent, RunEventKind
 from shared.bus.topics import Topic
 from shared.bus.traces import SimState, SimTruth
+from shared.can.sensor_frames import ImuAssembler, SampleAssembler
 from shared.clock import NS_PER_S
+from shared.config.files import to_toml
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import SCENARIO, Kill, Push, Restart, Scenario
+from shared.config.scenarios import SCENARIO, Keyframe, Kill, Push, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
+from shared.state import copied
 from tools.logs.hand_path import HandRow
 from tools.sim.network import BASE, VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus
 from tools.sim.virtual_services import (
+    HostClock,
+    Record,
     SharedMemory,
+    VirtualCan,
     VirtualHarness,
     VirtualImu,
     VirtualJoint,
     VirtualPlanner,
+    VirtualTime,
 )
-from tools.sim.virtual_time import HostClock, Record, VirtualTime
 
 SETTLE_NS = NS_PER_S
 """The scenario starts this long after all six modules track, ns."""
@@ -71,26 +74,6 @@ class FleetMoment(msgspec.Struct, frozen=True):
     """State of each joint service; one that is not named is dead."""
     planner: tuple[int, PlannerState] | None
     """Session and state of the planner; None: it is dead."""
-
-
-class _Periods(NamedTuple):
-    """Periods of what comes at a rate, ns."""
-
-    cycle: int
-    step: int
-    truth: int
-    sim_state: int
-    """0: it is not recorded."""
-
-    @classmethod
-    def of(cls, config: RobotConfig, *, traced: bool) -> _Periods:
-        rates_hz = (
-            config.joint_service.rate_hz,
-            1.0 / config.simulation.timestep,
-            config.simulation.truth_rate_hz,
-            topics.SIM_STATE.rate_hz if traced else math.inf,
-        )
-        return cls(*(round(NS_PER_S / rate_hz) for rate_hz in rates_hz))
 
 
 class _Progress(msgspec.Struct):
@@ -155,11 +138,9 @@ class Lockstep:
         self._check_kills(config, scenario)
         self.config, self.scenario = config, scenario
         self.plant = plant or PlantConfig()
-        self.world = World(body_of(config, self.plant), scenario)
         self.events: list[tuple[str, JointEvent]] = []
         self.time = time = VirtualTime(NS_PER_S)
-        self._record = record
-        self._controller = controller
+        self._record, self._traced, self._controller = record, traced, controller
         self.network = network_ = VirtualNetwork(
             network or BASE,
             scenario.inject,
@@ -168,11 +149,17 @@ class Lockstep:
         )
         clock_of = {name: HostClock() for name in ("planner", "harness", "imu", *MODULES)}
         clock_of |= clocks or {}
+        cells, frames = VirtualCan(SampleAssembler()), VirtualCan(ImuAssembler())
+        self._robot = robot = SimulatedRobot(
+            config, self.plant, scenario, cells=cells,
+            imu=frames if config.imu.fitted else None, seed=seed,
+        )  # fmt: skip
+        self.world, self.bank = robot.world, robot.bank
         self.harness = VirtualHarness(
-            config, network_, record, seed, time=time, clock=clock_of["harness"]
+            config, robot, cells, network_, record, time=time, clock=clock_of["harness"]
         )
         self._imu = VirtualImu(
-            config, self.plant.imu, network_, record, seed, time=time, clock=clock_of["imu"]
+            config, robot, frames, network_, record, time=time, clock=clock_of["imu"]
         )
         self._memory = SharedMemory()
         self._planner = VirtualPlanner(
@@ -180,25 +167,9 @@ class Lockstep:
             time=time, clock=clock_of["planner"], traced=traced,
             beside=self._memory if planner_beside else None,
         )  # fmt: skip
-        self.bank = AxisBank(
-            config.drive,
-            encoder_counts_per_turn=config.joint.encoder_counts_per_turn,
-            motor_signs=config.motor_signs(),
-            heat=self.plant.heat,
-        )
-        self._torque = self.bank.torque
-        self._faults = FaultInjector(scenario.fault, self.bank)
         self.buses = {
-            name: VirtualBus(
-                self.bank,
-                [
-                    2 * at + side
-                    for at, each in enumerate(MODULES)
-                    if config.module_named(each).bus == name
-                    for side in (0, 1)
-                ],
-            )
-            for name in dict.fromkeys(row.bus for row in config.module)
+            name: VirtualBus(self.bank, tuple(nodes.values()))
+            for name, nodes in axes_by_bus(config).items()
         }
         self.joints = [
             VirtualJoint(
@@ -208,7 +179,6 @@ class Lockstep:
             )
             for index, name in enumerate(MODULES)
         ]  # fmt: skip
-        self._periods = _Periods.of(config, traced=traced)
         happens: list[Happening] = [*scenario.kill, *scenario.restart, *scenario.push, *hand]
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
 
@@ -236,25 +206,25 @@ class Lockstep:
         self._planner.planner = planner
 
     @property
-    def controllers(self) -> list[JointController]:
-        """Each module's control law."""
-        return [joint.manager.controller for joint in self.joints]
+    def controllers(self) -> list[ControllerState]:
+        """State of each module's control law."""
+        return [joint.manager.state.controller for joint in self.joints]
 
     def moment(self) -> FleetMoment:
         """Return what world and services are now, for `resume`; it shares what still changes."""
         planner = self.planner
         return FleetMoment(
-            read_state(self.world, self.bank, self.now_ns, 0),
-            {joint.name: joint.manager.snapshot() for joint in self.joints},
-            None if planner is None else (planner.session, planner.snapshot()),
+            self._robot.read_state(self.now_ns, 0),
+            {joint.name: copied(joint.manager.state) for joint in self.joints},
+            None if planner is None else (planner.session, copied(planner.state)),
         )
 
     def resume(self, moment: FleetMoment) -> None:
         """Continue from a moment of another run, before the first step; links are empty then."""
         state, modules = moment.state, moment.modules
-        step_ns = self._periods.step
+        step_ns = self._robot.every.step
         self.time.now_ns = -(-state.t_ns // step_ns) * step_ns
-        write_state(self.world, self.bank, state)
+        self._robot.write_state(state)
         for joint in self.joints:
             joint.resume(modules.get(joint.name))
         self._planner.resume(moment.planner)
@@ -269,15 +239,16 @@ class Lockstep:
         Before the scenario starts its time is negative. Ends early if by then the robot has fallen,
         or if the scenario has not started when virtual time is past `READY_NS`.
         """
+        every = self._robot.every
         while self.world.scenario_s < self.scenario.duration:
             while self._progress.todo and self.world.scenario_s >= self._progress.todo[0].at:
                 self.act(self._progress.todo.pop(0))
             self.advance()
-            if self._periods.sim_state and self.now_ns % self._periods.sim_state == 0:
+            if self._traced and self.now_ns % every.state == 0:
                 self._progress.sim_states += 1
-                state = read_state(self.world, self.bank, self.now_ns, self._progress.sim_states)
+                state = self._robot.read_state(self.now_ns, self._progress.sim_states)
                 self._record(topics.SIM_STATE, "", state)
-            if self.now_ns % self._periods.truth == 0:
+            if self.now_ns % every.truth == 0:
                 truth = self.world.truth(self.now_ns, 1.0, 0.0)
                 self._record(topics.SIM_TRUTH, "", truth)
                 yield truth
@@ -286,23 +257,23 @@ class Lockstep:
 
     def advance(self) -> None:
         """Advance virtual time by one step of the world."""
-        now = self.now_ns
+        robot, now = self._robot, self.now_ns
         self.network.advance(self.world.scenario_s, now)
-        if now % self._periods.cycle == 0:
-            for fault in self._faults.advance(self.world.scenario_s):
+        if now % robot.every.encoders == 0:
+            for fault in robot.begin_faults():
                 self._put_event(RunEventKind.FAULTED, fault.module, fault.kind)
             for bus in self.buses.values():
                 bus.advance(now)
-            self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
+            robot.step_drives()
             self._cycle_joints()
         elif self.bank.regulates:
-            self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
-        self.harness.advance(self.world)
-        self._imu.advance(self.world)
+            robot.step_drives()
+        self.harness.advance()
+        self._imu.advance()
         self._planner.advance()
         self._start_when_tracking(now)
-        self.world.step(self._torque)
-        self.time.now_ns += self._periods.step
+        robot.step_world()
+        self.time.now_ns += robot.every.step
 
     def _new_planner(self, session: int) -> Planner:
         if self._controller is None:
@@ -337,8 +308,9 @@ class Lockstep:
             step_s = min(1.0, seconds)
             heat.skip(heat.load, step_s)
             for joint in self.joints:
-                joint.manager.controller.heat.skip(step_s)
-                joint.manager.controller.heat.report(*joint.drive.thermistors())
+                estimate, state = joint.manager.controller.heat, joint.manager.state.controller.heat
+                estimate.skip(state, step_s)
+                report(state, *joint.drive.thermistors())
             seconds -= step_s
 
     def act(self, row: Happening) -> None:
@@ -396,3 +368,49 @@ class Lockstep:
                     f"{service}@{at:g}: in lockstep only the planner can be killed, and "
                     "joint services with the onboard loop; use `xrl demo` for the others"
                 )
+
+
+NOTHING_HAPPENS: Final = Scenario(
+    name="stand", about="nothing happens", duration=1.0, keyframe=(Keyframe(at=0.0, height=1.188),)
+)
+
+
+def begin_standing(fleet: Lockstep) -> bool:
+    """Put a new fleet where the robot stands, all six track and its scenario begins.
+
+    To stand up takes 3.6 s of each run. Where many runs of one robot on one plant follow each
+    other, it is stood up once in each process, and each run continues from there. Standing up
+    itself is tested by `tests/lockstep/test_dead_services.py` and by the sweeps over drawn plants:
+    they begin on the hoist.
+
+    Returns:
+        False if this robot is never led on this plant: it then begins on the hoist.
+    """
+    start = standing(fleet.config, fleet.plant)
+    if start is not None:
+        fleet.resume(start)
+    return start is not None
+
+
+def standing(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
+    """Return the moment at which a scenario begins; None if it never does.
+
+    Args:
+        robot: ready to run.
+        plant: the true robot; the network is `BASE`.
+    """
+    schedule = robot.gain_schedule
+    key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
+    if key not in _known:
+        _known[key] = _stood_up(robot, plant)
+    return _known[key]
+
+
+_known: dict[tuple[str, str, str], FleetMoment | None] = {}
+
+
+def _stood_up(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
+    fleet = Lockstep(robot, NOTHING_HAPPENS, BASE, plant=plant)
+    if not any(row.scenario_s >= 0.0 for row in fleet.run()) or fleet.planner is None:
+        return None
+    return fleet.moment()

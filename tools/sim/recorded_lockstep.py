@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from services.planner.controller_file import ATTACHED, controller_maker, split_spec
+from services.planner.controller import ATTACHED, controller_maker, split_spec
 from services.simulator.physics.plant import PlantConfig
 from shared import revision
 from shared.bus import topics
@@ -28,9 +28,9 @@ from tools.judge.figure import judge_run
 from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow
-from tools.sim.centralised.fleet import CONTROLS, SHIPPED
+from tools.sim.centralised import CONTROLS, SHIPPED
 from tools.sim.lockstep import Watch
-from tools.sim.virtual_time import Record
+from tools.sim.virtual_services import Record
 
 Outcome = TypeVar("Outcome")
 AFTER_FALL_S: Final = 1.0

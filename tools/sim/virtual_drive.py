@@ -12,13 +12,12 @@ from services.joint.drivers.base import (
     HEAT_EVERY_NS,
     SUPPLY_EVERY_NS,
     DriveReading,
-    DriveStatus,
     MotorTarget,
     real_readings,
 )
 from services.joint.drivers.bus_watch import BusWatch
 from services.simulator.drives.axis_bank import AxisBank
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.can.interface import QUEUED_MAX
 from shared.clock import NS_PER_MS, NS_PER_S

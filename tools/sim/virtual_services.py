@@ -21,21 +21,96 @@ from services.planner.intents import OperatorRequest
 from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner, PlannerState
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.fronts.sensor_fronts import HarnessFront, ImuFront
-from services.simulator.physics.plant import ImuErrors
-from services.simulator.physics.world import World
+from services.simulator.robot import SimulatedRobot
 from shared.bus import topics
-from shared.bus.messages import Estop, TareRequest
+from shared.bus.messages import Estop, Message, TareRequest, Vector6
+from shared.bus.topics import Topic
 from shared.bus.traces import PlannerCheckpoint
-from shared.can.frame_group import FrameGroup
-from shared.can.imu_can import ImuAssembler
-from shared.can.loadcell_can import SampleAssembler
-from shared.clock import NS_PER_S
+from shared.can.sensor_frames import FrameGroup, ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tools.sim.network import VirtualNetwork
+from shared.state import copied
+from tools.sim.network import VirtualLink, VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus, VirtualDrive
-from tools.sim.virtual_time import HostClock, LinkInbox, Record, RecordOutbox, VirtualTime
+
+M = TypeVar("M", bound=Message)
+
+Record = Callable[[Topic, str, Message], None]
+"""Takes what live would be on the bus: topic, module or "", message."""
+
+
+class HostClock:
+    """The monotonic clock of one host.
+
+    It cannot step, whatever is done to the time of day, but no two hosts agree on it: an age is
+    measured on one clock only (docs/architecture.md#age-rule).
+    """
+
+    def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
+        """Begin.
+
+        Args:
+            offset_ns: ahead of virtual time at its zero.
+            drift_ppm: so much too fast, in millionths.
+        """
+        self.offset_ns = offset_ns
+        self.drift_ppm = drift_ppm
+
+    def read(self, now_ns: int) -> int:
+        """Return the host's time at a virtual time, ns."""
+        drift_ns = round(now_ns * self.drift_ppm * 1e-6) if self.drift_ppm else 0
+        return now_ns + self.offset_ns + drift_ns
+
+    def step(self, by_ns: int) -> None:
+        """Step the clock, which a monotonic clock never does."""
+        self.offset_ns += by_ns
+
+
+class VirtualTime:
+    """The time of a run, which all its processes share and none of them knows."""
+
+    def __init__(self, now_ns: int) -> None:
+        self.now_ns = now_ns
+
+    def on(self, clock: HostClock) -> Callable[[], int]:
+        """Return a host's clock, to be read now."""
+        return lambda: clock.read(self.now_ns)
+
+
+class LinkInbox(Generic[M]):
+    """The receiving end of a link: an `Inbox`."""
+
+    refused = 0
+
+    def __init__(self, link: VirtualLink[M], time: VirtualTime) -> None:
+        self._link, self._time = link, time
+
+    def take(self) -> M | None:
+        """Return the newest message that has arrived and was not taken before."""
+        return self._link.take(self._time.now_ns)
+
+
+class RecordOutbox(Generic[M]):
+    """The sending end of a link, if anybody listens, and of the record: an `Outbox`."""
+
+    def __init__(
+        self,
+        record: Record,
+        topic: Topic,
+        module: str = "",
+        link: VirtualLink[M] | None = None,
+        time: VirtualTime | None = None,
+    ) -> None:
+        self._record, self._topic, self._module = record, topic, module
+        self._link, self._time = link, time
+
+    def put(self, message: M, /) -> bool:
+        """Send and record."""
+        if self._link is not None and self._time is not None:
+            self._link.put(self._time.now_ns, message)
+        self._record(self._topic, self._module, message)
+        return True
+
 
 S = TypeVar("S")
 
@@ -46,7 +121,7 @@ class SharedMemory:
     Attributes:
         estop: set it to stop every module.
         rows: as each service wrote its own last, in virtual time.
-        planner: session of the planner's process on this host; 0: there is none.
+        planner: session of the planner's process on this host; 0 without one.
         ended: session of the one that ended last.
     """
 
@@ -165,7 +240,10 @@ class VirtualJoint:
             neighbours=self._place,
             clock=self._clock,
         )
-        self._place.write(row_of(manager.controller, self._clock()))
+        self._write_row()
+
+    def _write_row(self, *, is_dead: bool = False) -> None:
+        self._place.write(row_of(self.manager.state.controller, self._clock()), is_dead=is_dead)
 
     def cycle(self) -> DriveAction:
         """Run one cycle."""
@@ -174,7 +252,9 @@ class VirtualJoint:
     def kill(self, *, for_good: bool) -> None:
         """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
-        self._place.write(row_of(self.manager.controller, self._clock()), is_dead=self._is_dead)
+        self._place.write(
+            row_of(self.manager.state.controller, self._clock()), is_dead=self._is_dead
+        )
 
     def restart(self) -> None:
         """Continue a frozen service; a dead one is replaced, and takes over its armed drive."""
@@ -189,8 +269,8 @@ class VirtualJoint:
         if state is None:
             self.kill(for_good=True)
         else:
-            self.manager.restore(state)
-            self._place.write(row_of(self.manager.controller, self._clock()))
+            self.manager.state = copied(state)
+            self._write_row()
         self.drive.assume_heard()
 
 
@@ -282,7 +362,7 @@ class VirtualPlanner:
         self._session, state = start
         if self.planner is None or self.planner.session != self._session:
             self.planner = self._make(self._session)
-        self.planner.restore(state)
+        self.planner.state = copied(state)
 
 
 class VirtualCan(Generic[S]):
@@ -294,7 +374,7 @@ class VirtualCan(Generic[S]):
         self._newest: S | None = None
 
     def poll(self) -> None:
-        """Do nothing: nobody has to be let in."""
+        """Do nothing: no client has to be admitted."""
 
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
         """Take the frames of one sample."""
@@ -307,43 +387,34 @@ class VirtualCan(Generic[S]):
         return sample
 
 
-def whole_steps_ns(config: RobotConfig, rate_hz: float) -> int:
-    """Return a sensor's period in whole steps of the world, ns, as the live simulator has it."""
-    step_ns = round(config.simulation.timestep * NS_PER_S)
-    return step_ns * max(1, round(NS_PER_S / (rate_hz * step_ns)))
-
-
 class VirtualHarness:
-    """Sensor and service in one; both begin with a tare, while the hoist holds."""
+    """Service of the load cells; it begins with a tare, while the hoist holds."""
 
     def __init__(
         self,
         config: RobotConfig,
+        robot: SimulatedRobot,
+        cells: VirtualCan[Vector6],
         network: VirtualNetwork,
         record: Record,
-        seed: int,
         *,
         time: VirtualTime,
         clock: HostClock,
     ) -> None:
-        """Draw the cells' zero offsets from `seed`, and their noise."""
-        cells = VirtualCan(SampleAssembler())
-        self._front = HarnessFront(config, cells, seed)
         wrenches = RecordOutbox(record, topics.WRENCH, "", network.wrenches(), time)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), wrenches, self)
-        self._period_ns = whole_steps_ns(config, config.harness.rate_hz)
-        self._time, self._clock = time, time.on(clock)
+        self._robot, self._time, self._clock = robot, time, time.on(clock)
         self._request: TareRequest | None = None
 
-    def advance(self, world: World) -> None:
+    def advance(self) -> None:
         """If it is time, sample what acts on the torso, and run one cycle of the service."""
-        if not self._time.now_ns % self._period_ns:
-            self._front.send(world.outside.harness_force, world.outside.harness_moment)
+        if not self._time.now_ns % self._robot.every.harness:
+            self._robot.feel()
             self._loop.cycle(self._clock())
 
     def assume_tared(self) -> None:
         """Set the tare as done: in the middle of a run the operator's load is on the cells."""
-        self._loop.state = tared_state(self._front.bias)
+        self._loop.state = tared_state(self._robot.harness.bias)
 
     def tare(self, request: TareRequest) -> None:
         """Ask for a new zero, from the next cycle on."""
@@ -356,30 +427,26 @@ class VirtualHarness:
 
 
 class VirtualImu:
-    """Sensor and service in one."""
+    """Service of the IMU, if one is fitted."""
 
     def __init__(
         self,
         config: RobotConfig,
-        errors: ImuErrors,
+        robot: SimulatedRobot,
+        frames: VirtualCan[ImuSample],
         network: VirtualNetwork,
         record: Record,
-        seed: int,
         *,
         time: VirtualTime,
         clock: HostClock,
     ) -> None:
-        """Mount the sensor with the plant's errors, if one is fitted; `seed` is its noise's."""
-        frames = VirtualCan(ImuAssembler())
-        self._fitted = config.imu.fitted
-        self._period_ns = whole_steps_ns(config, config.imu.rate_hz)
-        self._time, self._clock = time, time.on(clock)
-        self._front = ImuFront(config.imu, errors, frames, seed)
+        self._robot, self._time, self._clock = robot, time, time.on(clock)
         attitudes = RecordOutbox(record, topics.ATTITUDE, "", network.attitudes(), time)
         self._loop = ImuLoop(frames, AttitudeLaw(config.imu), attitudes)
 
-    def advance(self, world: World) -> None:
+    def advance(self) -> None:
         """If it is time, sample how the torso stands, and run one cycle of the service."""
-        if self._fitted and not self._time.now_ns % self._period_ns:
-            self._front.send(world)
+        robot = self._robot
+        if robot.imu is not None and not self._time.now_ns % robot.every.imu:
+            robot.imu.send(robot.world)
             self._loop.cycle(self._clock())

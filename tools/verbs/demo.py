@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated, Final
 
-from services.planner.controller_file import controller_maker
+from services.planner.controller import controller_maker
 from services.simulator.physics.plant import plant_from
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
@@ -83,14 +83,14 @@ def run(flags: DemoFlags) -> int:
     experiment.introduce(scenario, console)
     warn_of_others(console)
     try:
-        ended = lead_run(flags, robot, scenario, out, console)
+        ended = _lead_run(flags, robot, scenario, out, console)
     except KeyboardInterrupt:
         console.print(f"interrupted; what was recorded until then is in {out}")
         raise
     return judge(out, scenario, ended, console)
 
 
-def lead_run(
+def _lead_run(
     flags: DemoFlags, robot: RobotConfig, scenario: Scenario, out: Path, console: Console
 ) -> EndOfRun:
     """Run the scenario on a fleet of its own, and show it."""

@@ -8,12 +8,12 @@ from typing import Annotated, Final
 
 from shared.exceptions import FleetError
 from shared.joints import MODULES
-from tools.bringup.resuming import rests_after_down
+from tools.bringup.zero_record import rests_after_down
 from tools.flags import Arg, Duration, RunDirFlags
 from tools.fleet import procfs
-from tools.fleet.descent import WAYS
-from tools.fleet.lowering import lower
 from tools.fleet.supervise import SupervisedFleet
+from tools.live.descent import WAYS
+from tools.live.lowering import lower
 
 EXAMPLES: Final = """
 xrl down                      # a robot that bears weight goes down first, and waits to be hung

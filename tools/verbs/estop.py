@@ -1,4 +1,4 @@
-"""`xrl estop`: every module to DAMP, now, by shared memory and over the bus."""
+"""`xrl estop` and `xrl pendant`: every module to DAMP, now or once a dead man's handle ends."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Final
 
+from services.joint.rearm_guard import Pendant
 from shared import places
 from shared.bus.credentials import require_operator
 from shared.bus.session import open_session
@@ -20,7 +21,7 @@ from shared.joints import MODULES
 from shared.places import ROBOT_FILE
 from shared.process import StopFlag
 from shared.run_directory import default_run_dir
-from tools.flags import Arg, Flags, names_of, parsed
+from tools.flags import Arg, Duration, Flags, RunDirFlags, names_of, option, parsed
 from tools.fleet.emergency_stop import BusStop, refuse_going, request_here, stop_all, wait_here
 from tools.fleet.run_dir import RunDir
 from tools.keyboard import typed_line
@@ -28,7 +29,9 @@ from tools.terminal import Console
 
 EVERY_S: Final = 0.02
 LINKS_S: Final = 2.0
-"""Time that the links may take to come up before a silent module is told, s."""
+"""Time that the links may take to come up before a silent module is reported, s."""
+OTHER_S: Final = 0.2
+"""Wait in which another pendant's beats would show, s."""
 
 
 EXAMPLES: Final = """
@@ -37,6 +40,8 @@ xrl estop --run-dir /tmp/lab
 xrl estop --local                       # on the robot's own host: needs no bus
 xrl estop --config lab.toml             # from another computer, with an operator's key
 xrl estop --config lab.toml --wait      # open the links now; Enter or Ctrl-C is the stop
+xrl pendant               # Enter lays it down without a stop; Ctrl-C stops every module
+xrl pendant --for 600     # lays itself down after ten minutes
 """
 
 
@@ -74,7 +79,7 @@ class EstopFlags(Flags):
             raise FleetError("--wait is for the bus; `xrl pendant` waits by shared memory")
 
 
-def run(flags: EstopFlags) -> int:
+def estop(flags: EstopFlags) -> int:
     """Repeat the stop until every module has stopped; only a restart leaves DAMP."""
     run_dir = flags.run_dir
     is_here = _is_here(flags)
@@ -154,3 +159,44 @@ def _conclude(going: list[str], which: str) -> None:
         f"{which} are stopped: DAMP. The robot sinks slowly, or holds beside a limp or dead "
         "module; `xrl rearm` or `xrl down` ends it"
     )
+
+
+class PendantFlags(RunDirFlags):
+    """How long."""
+
+    for_s: Annotated[Duration | None, option("--for")] = None
+    """lay it down after S seconds"""
+
+
+def pendant(flags: PendantFlags) -> int:
+    """Beat until it is laid down; 0 then, and after a stop that reached this host's modules."""
+    try:
+        handle = Pendant(flags.run_dir, MODULES)
+    except OSError as error:
+        raise FleetError(
+            f"{flags.run_dir}: no shared memory for the pendant: {error.strerror}"
+        ) from None
+    if not handle.modules:
+        raise FleetError(f"{flags.run_dir}: no joint service of a fleet is on this host")
+    before = handle.beats
+    time.sleep(OTHER_S)
+    if handle.beats != before:
+        raise FleetError("another pendant is held: lay that one down first")
+    console, stop = Console(), StopFlag(signal.SIGHUP)
+    elsewhere = [module for module in MODULES if module not in handle.modules]
+    if elsewhere:
+        console.print(f"does not stop {', '.join(elsewhere)}: they have no service on this host")
+    console.print("held: Enter lays it down; Ctrl-C, or this program's end, stops all modules")
+    ends = None if flags.for_s is None else time.monotonic() + flags.for_s
+    shown = None
+    while not stop and shown != "":
+        handle.beat()
+        shown = typed_line(EVERY_S)
+        if shown or (ends is not None and time.monotonic() >= ends):
+            handle.lay_down()
+            console.print("laid down: the robot continues without it")
+            return 0
+    request_here(flags.run_dir)  # faster than the pendant's silence
+    going = wait_here(flags.run_dir, list(handle.modules), handle.modules)
+    _conclude(going, f"{len(handle.modules)} modules")
+    return 0

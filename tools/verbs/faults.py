@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterator
+from typing import Final, NamedTuple
 
 import msgspec
 from rich.table import Table
 
 from shared.config.files import load
 from shared.config.scenarios import FAULT_KINDS
-from shared.config.sections import TripLimit
+from shared.config.sections import TripLimit, TripsConfig
 from shared.robot.fault_table import DRIVE_FAULTS, LOSSES
 from shared.robot.trip_table import JOINT_TRIPS, PLANNER_TRIPS, TripRow
 from tools.flags import ConfigFlags
@@ -25,6 +26,16 @@ xrl sim --fault knee_left:encoder@4     # to see one
 """
 
 
+class FaultSection(NamedTuple):
+    """A table of faults, for a terminal and for a page."""
+
+    title: str
+    about: str
+    headings: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    """Name first."""
+
+
 class FaultsFlags(ConfigFlags):
     """Whose limits, and in which form."""
 
@@ -33,68 +44,76 @@ class FaultsFlags(ConfigFlags):
 
 
 def run(flags: FaultsFlags) -> int:
-    """Print the table."""
+    """Print the tables."""
     limits = load(flags.config).trips
-    trips = {
-        trip.name: (row, getattr(limits, row.key))
-        for trip, row in (*JOINT_TRIPS.items(), *PLANNER_TRIPS.items())
-    }
     if flags.json:
+        trips = {trip.name: row for trip, row in (*JOINT_TRIPS.items(), *PLANNER_TRIPS.items())}
         rows = {
             "drive": {kind: row._asdict() for kind, row in DRIVE_FAULTS.items()},
             "fleet": {name: row._asdict() for name, row in LOSSES.items()},
             "trips": {
-                name: row._asdict() | msgspec.to_builtins(limit)
-                for name, (row, limit) in trips.items()
+                name: row._asdict() | msgspec.to_builtins(getattr(limits, row.key))
+                for name, row in trips.items()
             },
         }
         print(msgspec.json.format(msgspec.json.encode(rows)).decode())
         return 0
     console = Console(highlight=False)
-    console.print(
-        marked(
-            "[bold]A drive's fault.[/] Once it is noticed its module goes to FAULT, and the "
-            "planner has the other five HOLD. An axis that disarms floats; its sibling keeps its "
-            "torque until the service idles it, at once. Nothing is re-armed automatically: remove "
-            "the cause, then restart the module's service (`xrl kill MODULE`).\n"
-        )
-    )
-    for kind, row in DRIVE_FAULTS.items():
-        limp = "limp" if row.limp else "held"
-        console.print(marked("[bold]{}[/]: {}", kind, FAULT_KINDS[kind].about))
-        _say(console, "the drive", f"{row.drive} ({limp})")
-        _say(console, "because", row.cause.name if row.cause else "no FAULT: it stays in control")
-        _say(console, "way out", row.recovery)
-    console.print(marked("\n[bold]What else can be lost.[/]\n"))
-    for name, loss in LOSSES.items():
-        console.print(marked("[bold]{}[/]", name))
-        _say(console, "module", loss.module)
-        _say(console, "others", loss.others)
-        _say(console, "you see", loss.visible)
-        _say(console, "it ends", loss.recovery)
-    console.print(
-        marked(
-            "\n[bold]Trips.[/] Each module and the planner check these while the planner leads: "
-            "all six HOLD. The planner leads again after a wait that grows with each trip.\n"
-        )
-    )
-    for name, (trip, limit) in trips.items():
-        console.print(marked("[bold]{}[/]: {}", name, trip.measured))
-        _say(console, "trips", _describe_limit(trip, limit))
-        _say(console, "you do", trip.recovery)
+    for title, about, headings, found in sections(limits):
+        console.print(marked("\n[bold]{}.[/] {}\n", title, " ".join(about.split())))
+        for name, *cells in found:
+            console.print(marked("[bold]{}[/]", name))
+            grid = Table.grid(padding=(0, 1))  # a label, and its text wrapped under itself
+            grid.add_column(width=_LABEL_WIDTH, justify="right", style="dim")
+            grid.add_column()
+            for label, cell in zip(headings[1:], cells, strict=True):
+                grid.add_row(label, cell)
+            console.print(grid)
     return 0
 
 
-def _describe_limit(row: TripRow, limit: TripLimit) -> str:
+def sections(limits: TripsConfig) -> Iterator[FaultSection]:
+    """Yield the faults of drives, the losses and the trips."""
+    yield FaultSection(
+        "A fault of a drive",
+        """\
+The module goes to FAULT and the planner holds the other five. An axis that disarms floats; its
+sibling keeps its torque until the service idles it, at once. Nothing is re-armed automatically: a
+person removes the cause, then restarts the module's service (`xrl kill MODULE`). To see one:
+`xrl sim --fault knee_left:encoder@4`.""",
+        ("fault", "it is", "the drive", "limp", "zero lost", "cause", "you do"),
+        [
+            (
+                kind, FAULT_KINDS[kind].about, row.drive, "yes" if row.limp else "no",
+                "yes" if row.zero_lost else "no", row.cause.name if row.cause else "no FAULT",
+                row.recovery,
+            )
+            for kind, row in DRIVE_FAULTS.items()
+        ],
+    )  # fmt: skip
+    yield FaultSection(
+        "A lost process or link, and the emergency stop",
+        "A joint service holds its module while the planner or its link is gone.",
+        ("lost", "module", "others", "you see", "it ends"),
+        [(name, *loss) for name, loss in LOSSES.items()],
+    )
+    trips = [(cause.name, "the module", row) for cause, row in JOINT_TRIPS.items()]
+    trips += [(number.name, "the planner", row) for number, row in PLANNER_TRIPS.items()]
+    yield FaultSection(
+        "Trips",
+        """\
+A trip takes the robot out of being led: a module, or the planner, notices that a quantity is beyond
+its limit, and all six modules go to HOLD. The planner leads again after a wait that grows with each
+trip. Limits are those of `[trips]` in the robot file.""",
+        ("trip", "noticed by", "measured", "limit", "you do"),
+        [
+            (name, by, row.measured, _limit(row, getattr(limits, row.key)), row.recovery)
+            for name, by, row in trips
+        ],
+    )
+
+
+def _limit(row: TripRow, limit: TripLimit) -> str:
     beyond = "below" if row.least else "above"
     lasting = f" for {limit.after_ms:g} ms" if limit.after_ms else ""
     return f"{beyond} {limit.limit:g} {row.unit}{lasting} (trips.{row.key})"
-
-
-def _say(console: Console, label: str, text: str) -> None:
-    """Print one labelled line, wrapped under itself."""
-    grid = Table.grid(padding=(0, 1))
-    grid.add_column(width=_LABEL_WIDTH, justify="right", style="dim")
-    grid.add_column()
-    grid.add_row(label, text)
-    console.print(grid)

@@ -18,7 +18,7 @@ from shared.exceptions import FAULT_EXIT_CODE, ConfigError
 from shared.extras import require
 from shared.places import refuse_shipped
 from tools.flags import Arg, ConfigFlags, option
-from tools.lab.design import damping_picture, split_program
+from tools.lab.design import split_program
 from tools.lab.design.body_stiffness import BodyStiffness, for_robot
 from tools.lab.design.dynamic_certificate import BLIND, BLIND_S, DynamicCertificate
 from tools.lab.design.push_limit import DIRECTIONS, equivalent_slope
@@ -46,7 +46,6 @@ EXAMPLES: Final = """
 xrl gains
 xrl gains --config lab.toml
 xrl gains --config lab.toml --damping-of deploy/robot.gains.json
-xrl gains --picture damping.png
 xrl gains --check
 xrl gains --stiffness
 """
@@ -58,8 +57,6 @@ class GainsFlags(ConfigFlags):
     damping_of: Path | None = None
     """take damping and coupling from another schedule, such as deploy/robot.gains.json, and check
     them with the dynamic certificate; without it the verb searches for them (two minutes)"""
-    picture: Annotated[Path | None, Arg(metavar="FILE.png")] = None
-    """draw how each motion decays, over the drivetrain's stiffness"""
     check_only: Annotated[bool, option("--check", exclusive="only")] = False
     """only say whether the schedule fits the robot"""
     stiffness: Annotated[bool, Arg(exclusive="only")] = False
@@ -79,14 +76,9 @@ def run(flags: GainsFlags) -> int:
         return FAULT_EXIT_CODE if stale else 0
     refuse_shipped(path)
     require("design")
-    if flags.picture is not None:
-        require("plot")
     schedule = compute(robot, console, flags.damping_of)
     gain_schedule.write(path, schedule)
     _show(robot, schedule, console)
-    if flags.picture is not None:
-        draw_damping(robot, schedule, flags.picture)
-        console.print(f"drawn to {flags.picture}", style="dim", soft_wrap=True)
     console.print(f"written to {path}", style="dim", soft_wrap=True)
     return 0
 
@@ -189,12 +181,6 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
         f"while an encoder is blind, {1e3 * BLIND_S:.0f} ms, a motion grows to at most "
         f"{math.exp(BLIND_S * blind):.2f} times its size"
     )
-
-
-def draw_damping(robot: RobotConfig, schedule: GainSchedule, path: Path) -> None:
-    """Draw the eigenvalue paths of a schedule into a PNG file."""
-    nodes = [node for node in split_program.dynamic_nodes(robot, schedule) if node.pitch == 0.0]
-    damping_picture.draw(robot, nodes, split_program.design_of(schedule), path)
 
 
 def _decibels(factor: float) -> str:

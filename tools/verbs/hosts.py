@@ -11,18 +11,20 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from shared.bus.topics import RECORDER
 from shared.config import files as config_file
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FleetError, RunError
 from tools.flags import ConfigFlags, Duration, Folder, option, positional
 from tools.fleet.status_table import tables
-from tools.hosts import hosts_file, installation, records, running
+from tools.hosts import hosts_file, installation, running
 from tools.hosts.hosts_file import Hosts
 from tools.hosts.installation import HostFile, HostRow
 from tools.hosts.remote import Remote, on_all
 from tools.keys import authority as authorities
 from tools.keys.authority import Authority
+from tools.logs.run_index import RunIndex, runs_in
 from tools.output import write_atomically
 from tools.terminal import Console, marked
 
@@ -218,22 +220,21 @@ def bring(flags: RecordsFlags) -> int:
     out = flags.out
     if out.exists() and any(out.iterdir()):
         raise RunError(f"{out}: is not empty; give another folder")
-    fleets = [remote for remote in given.remotes if records.is_fleets(remote)]
-    if not fleets:
+    body = next((one for one in given.remotes if RECORDER in one.host.services), None)
+    if body is None:
         raise RunError("the recorder's host is not among those named: its record comes first")
-    (body,) = fleets
     if not flags.while_up:
         installation.refuse_up(body, "the records would delay the planner on the same network")
-    base = records.fetch(body, records.newest(body), out / body.host.name)
+    base = running.fetch_record(body, running.newest_record(body), out / body.host.name)
     _tell(body.host.name, str(base))
-    fleets_run = records.fleets_run(base)
+    began_s = RunIndex(base, runs_in(base)[-1]).began_ns * 1e-9
 
     def one(remote: Remote) -> str:
-        names = records.since(remote, fleets_run.began_ns * 1e-9)
-        mine = [records.fetch(remote, name, out / remote.host.name) for name in names]
+        names = running.records_since(remote, began_s)
+        mine = [running.fetch_record(remote, name, out / remote.host.name) for name in names]
         return ", ".join(map(str, mine)) or "no record since then"
 
-    others = [r for r in given.remotes if not records.is_fleets(r) and r.host.record]
+    others = [one for one in given.remotes if one is not body and one.host.record]
     return _each(given._replace(remotes=others), one) if others else 0
 
 

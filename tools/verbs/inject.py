@@ -115,7 +115,7 @@ class InjectFlags(RunDirFlags):
             right = "write everything in the words ('all loss=20% for=5'), or everything as flags"
             raise RunError(f"{WORDS} with {names}: {right}")
         if not other:
-            inject_of(self)
+            _inject_of(self)
 
 
 def run(flags: InjectFlags) -> int:
@@ -127,7 +127,7 @@ def run(flags: InjectFlags) -> int:
     elif flags.clear:
         _clear(client, flags.link or ALL, console)
     else:
-        inject = inject_of(flags)
+        inject = _inject_of(flags)
         show(client.begin(inject, inject.at), console)
     return 0
 
@@ -148,7 +148,7 @@ def _clear(client: ProxyClient, link: str, console: Console) -> None:
     show(left, console)
 
 
-def inject_of(flags: InjectFlags) -> Inject:
+def _inject_of(flags: InjectFlags) -> Inject:
     """Return the requested impairment; its `at` counts from now."""
     if flags.words is not None:
         try:

@@ -72,9 +72,9 @@ class RenewFlags(MakeFlags):
 
     names: Annotated[
         tuple[str, ...],
-        positional("NAME", exclusive="which!", help=", ".join(PRINCIPALS)),
+        positional("NAME", one_of="which", help=", ".join(PRINCIPALS)),
     ] = ()
-    all: Annotated[bool, Arg(exclusive="which!")] = False
+    all: Annotated[bool, Arg(one_of="which")] = False
     """all of them"""
 
 
@@ -83,9 +83,9 @@ class PackFlags(KeysFlags):
 
     names: Annotated[tuple[str, ...], positional("NAME")] = ()
     """what runs there; none: everything"""
-    out: Annotated[Path | None, option("-o", "--out", metavar="FILE", exclusive="out!")] = None
+    out: Annotated[Path | None, option("-o", "--out", metavar="FILE", one_of="out")] = None
     """a tar file with keys/ in it"""
-    install: Annotated[bool, Arg(exclusive="out!")] = False
+    install: Annotated[bool, Arg(one_of="out")] = False
     """this host: write bus.security.keys"""
 
 

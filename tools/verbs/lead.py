@@ -26,10 +26,7 @@ from tools.fleet.led_planner import asker, other_asker
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
 from tools.live.assist_request import ask, refuse_beyond_limits
-from tools.pads.calibration import calibrate, keep
-from tools.pads.controls import BUTTONS
-from tools.pads.gamepad import Gamepad, open_pad, open_pads
-from tools.pads.mappings import mapping_of
+from tools.pads.gamepad import BUTTONS, Gamepad, find_pad
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 
@@ -65,10 +62,9 @@ KEYS: Final = {
 EXAMPLES: Final = """
 xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
 xrl lead --keys          # arrows: height and pitch; + and -: assist; space: stop
-xrl lead --pad /dev/input/event7 --hold leftshoulder --stop x
+xrl lead --pad Xbox --hold leftshoulder --stop x
 xrl lead --assist 80 --for 60             # no pad: N for a minute, then it fades out
 xrl lead --assist 0 --shift 0.02,0,0,0    # lean the COM 2 cm forwards
-xrl lead --calibrate     # an unknown pad: asks for each stick, trigger and button
 """
 
 
@@ -77,8 +73,8 @@ class LeadFlags(RunDirFlags):
 
     keys: Annotated[bool, Arg(exclusive="by")] = False
     """lead by the keys of this terminal, not a gamepad"""
-    pad: Annotated[str | None, Arg(metavar="DEVICE", exclusive="by")] = None
-    """event device (default: the first gamepad)"""
+    pad: Annotated[str | None, Arg(metavar="NAME", exclusive="by")] = None
+    """part of the pad's name or path, such as Xbox or /dev/input/event7 (default: the first pad)"""
     assist: Annotated[Number | None, Arg(metavar="N", exclusive="by")] = None
     """lead nothing: ask the robot to carry N newtons of the person until Ctrl-C; then fade out"""
     shift: Annotated[
@@ -92,33 +88,29 @@ class LeadFlags(RunDirFlags):
     """dead man's button"""
     stop: Annotated[str, Arg(choices=BUTTONS)] = "b"
     """emergency stop"""
-    calibrate: bool = False
-    """learn and store what the pad's axes and buttons mean; needs no robot"""
 
     def check(self) -> None:
         """Refuse what goes with another way of leading."""
         super().check()
         if self.hold == self.stop:
             raise FleetError(f"--hold and --stop are both {self.hold}; give two buttons")
-        if self.calibrate and (self.keys or self.assist is not None):
-            raise FleetError("--calibrate is for a pad: leave out --keys or --assist")
         if self.assist is None and (self.shift is not None or self.for_s is not None):
             raise FleetError("--shift and --for go with --assist N; --assist 0 only shifts")
 
 
 def run(flags: LeadFlags) -> int:
     """Lead until q, Ctrl-C, the stop, or the loss of the pad."""
-    if flags.calibrate:
-        return _calibrate(flags)
     fleet = SupervisedFleet.attach(flags.run_dir)
     robot = fleet.manifest.robot()
     if flags.assist is not None:
         return _ask(robot, fleet.run.path, flags.assist, flags)
     require_operator(robot, "lead")
-    pad = None if flags.keys else _opened(flags)
+    pad = None
+    if not flags.keys:
+        pad = Gamepad(find_pad(flags.pad), hold=flags.hold, stop=flags.stop)
     console = Console()
     with open_session(robot, "lead", fleet.run.path) as session:
-        leader = Leader(robot, session, simulated="simulator" in fleet.manifest.services)
+        leader = _Leader(robot, session, simulated="simulator" in fleet.manifest.services)
         ended = _by_pad(pad, leader, console) if pad is not None else _by_keys(leader, console)
         if ended is not Key.STOP:
             console.print(f"let go: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
@@ -149,20 +141,7 @@ def _ask(robot: RobotConfig, run_dir: Path, assist_n: float, flags: LeadFlags) -
     return 0
 
 
-def _opened(flags: LeadFlags) -> Gamepad:
-    device = open_pad(flags.pad)
-    return Gamepad(device, mapping_of(device), hold=flags.hold, stop=flags.stop)
-
-
-def _calibrate(flags: LeadFlags) -> int:
-    device = open_pads(flags.pad)[0]
-    print(f"{device.name}; another one: --pad DEVICE")
-    mapping = calibrate(device, print)
-    print(f"{device.name}: kept in {keep(device, mapping)}; `xrl lead` uses it from now on")
-    return 0
-
-
-class Leader:
+class _Leader:
     """Sends where a person leads."""
 
     def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
@@ -187,7 +166,7 @@ class Leader:
     def take_hold(self) -> None:
         """Begin to lead again: with the assist that is given now, not with that of before."""
         status = self._newest()
-        self.pilot.keep_assist(0.0 if status is None else status.assist_n)
+        self.pilot.limit_assist(0.0 if status is None else status.assist_n)
 
     @property
     def other(self) -> str:
@@ -224,7 +203,7 @@ class Leader:
         return self._last
 
 
-def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
+def _by_pad(pad: Gamepad, leader: _Leader, console: Console) -> Key | None:
     """Lead by a pad until it is over; STOP if it was the stop."""
     console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C ends it")
     settling = time.monotonic() + SETTLE_S
@@ -253,7 +232,7 @@ def _by_pad(pad: Gamepad, leader: Leader, console: Console) -> Key | None:
     return None
 
 
-def _by_keys(leader: Leader, console: Console) -> Key | None:
+def _by_keys(leader: _Leader, console: Console) -> Key | None:
     """Lead by keys until it is over; STOP if it was the stop."""
     stop = StopFlag()
     with Keyboard(KEYS) as keyboard:
@@ -269,7 +248,7 @@ def _by_keys(leader: Leader, console: Console) -> Key | None:
                 if Key.QUIT in presses:
                     return None
                 now = time.monotonic()
-                leader.lead(deflection_of(presses), min(now - last, KEY_HELD_S))
+                leader.lead(_deflection_of(presses), min(now - last, KEY_HELD_S))
                 last = now
                 shown.update(leader.describe("led"))
         if not keyboard.present:
@@ -277,7 +256,7 @@ def _by_keys(leader: Leader, console: Console) -> Key | None:
     return None
 
 
-def deflection_of(presses: Sequence[Key]) -> Deflection:
+def _deflection_of(presses: Sequence[Key]) -> Deflection:
     """Return what several keys ask for together; however often one is repeated, at most full."""
     parts = [sum(float(press.value[axis]) for press in presses) for axis in range(3)]
     height, pitch, assist = (max(-1.0, min(1.0, part)) for part in parts)

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from services.planner.controller_file import controller_maker
+from services.planner.controller import controller_maker
 from services.simulator.physics.plant import plant_from
 from shared.bus import topics
 from shared.bus.traces import SimTruth
@@ -22,7 +22,7 @@ from tools.live import experiment
 from tools.logs.hand_path import HandRow, hand_path
 from tools.logs.run_log import read_run
 from tools.sim import recorded_lockstep
-from tools.sim.centralised.fleet import CONTROLS, SHIPPED
+from tools.sim.centralised import CONTROLS, SHIPPED
 from tools.terminal import Console
 
 Milliseconds = Annotated[float, Range(0.0, 1e12, "ms")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Final
 
 import msgspec
@@ -14,8 +13,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.process import StopFlag
 from tools.flags import Arg, RunDirFlags
-from tools.fleet.bus_faults import BusFaults
-from tools.fleet.fleet_status import RateMonitor, listen_for_all, monitors_of, read_status
+from tools.fleet.fleet_status import BusFaults, listen_for_all, monitors_of, read_status
 from tools.fleet.process_table import services_elsewhere
 from tools.fleet.procfs import use_of
 from tools.fleet.status_table import process_table, tables
@@ -55,30 +53,22 @@ def run(flags: StatusFlags) -> int:
     """Look at the fleet once, or until interrupted."""
     fleet = SupervisedFleet.attach(flags.run_dir, warn=False)  # it is in the table
     robot = fleet.manifest.robot()
-    security = robot.bus.security.mode
     if flags.traffic:
         return _show_traffic(fleet, robot, watch=flags.watch)
     with open_session(robot, "status", fleet.run.path) as session:
         monitors = monitors_of(session, fleet.manifest.topics)
         listen_for_all(monitors)
         bus = BusFaults(robot, session)
-        if flags.watch:
-            _watch(fleet, monitors, security, bus)
-        else:
-            status = read_status(fleet, monitors, security, bus)
-            if flags.json:
-                print(msgspec.json.format(msgspec.json.encode(status)).decode())
-            else:
-                Console().print(tables(status))
-    return 0
-
-
-def _watch(
-    fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], security: str, bus: BusFaults
-) -> None:
-    with renewed(Console()) as show:
-        while True:
-            show(tables(read_status(fleet, monitors, security, bus)))
+        if flags.json:
+            status = read_status(fleet, monitors, bus)
+            print(msgspec.json.format(msgspec.json.encode(status)).decode())
+            return 0
+        if not flags.watch:
+            Console().print(tables(read_status(fleet, monitors, bus)))
+            return 0
+        with renewed(Console()) as show:
+            while True:
+                show(tables(read_status(fleet, monitors, bus)))
 
 
 def _show_traffic(fleet: SupervisedFleet, robot: RobotConfig, *, watch: bool) -> int:

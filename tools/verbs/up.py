@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Final
 
-from services.planner.controller_file import ATTACHED, absolute, controller_maker, split_spec
+from services.planner.controller import ATTACHED, absolute, controller_maker, split_spec
 from services.ros2_gateway import rmw
 from services.ros2_gateway.inbound import acceptable
 from services.simulator.physics.plant import plant_from

@@ -15,8 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 from tools.view.frame import Frame, Newest
 from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source, without_fleet
 

@@ -10,7 +10,7 @@ from typing import Final
 
 import msgspec
 
-from services.simulator.physics.led_hand import PUSH_EXPIRES_S
+from services.simulator.physics.operator import PUSH_EXPIRES_S
 from shared.bus.messages import HandLead, Mode, Vector3
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES, SIDES

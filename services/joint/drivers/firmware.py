@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import Final, Literal
 
-from services.joint.drivers.base import DriveStatus
+from shared.bus.messages import DriveStatus
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisError, AxisState
 from shared.can.cansimple_06 import DriveError06, ProcedureResult

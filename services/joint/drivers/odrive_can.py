@@ -16,7 +16,6 @@ from services.joint.drivers.base import (
     HEAT_EVERY_NS,
     SUPPLY_EVERY_NS,
     DriveReading,
-    DriveStatus,
     MotorTarget,
     is_target,
 )
@@ -31,7 +30,7 @@ from services.joint.drivers.frame_times import EncoderPair, FrameTimes, OrderWin
 from services.joint.drivers.odrive_frames import Frames
 from services.joint.drivers.replies import NOTHING, Replies
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 from shared.can import cansimple
 from shared.can.cansimple import AxisState, Command
 from shared.can.cansimple_06 import Command06

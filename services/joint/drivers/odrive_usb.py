@@ -25,16 +25,10 @@ import msgspec
 from odrive.device_manager import DeviceManager, get_device_manager
 from odrive.runtime_device import RuntimeDevice
 
-from services.joint.drivers.base import (
-    HEAT_EVERY_NS,
-    DriveReading,
-    DriveStatus,
-    MotorTarget,
-    is_target,
-)
+from services.joint.drivers.base import HEAT_EVERY_NS, DriveReading, MotorTarget, is_target
 from services.joint.drivers.odrive_v3 import AxesStatus, OdriveV3
 from shared import log
-from shared.bus.messages import Pair
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisState
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS, machine_s, now_ns

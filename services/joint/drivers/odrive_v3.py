@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Any, Final
 
-from services.joint.drivers.base import DriveStatus, MotorTarget, real_readings
-from shared.bus.messages import Pair
+from services.joint.drivers.base import MotorTarget, real_readings
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError, AxisState, ControlMode, Heartbeat, InputMode
 from shared.exceptions import DriveError
 

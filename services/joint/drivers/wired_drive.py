@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
-from shared.bus.messages import LOST_DRIVE, Pair
+from services.joint.drivers.base import Drive, DriveReading, MotorTarget
+from shared.bus.messages import LOST_DRIVE, DriveStatus, Pair
 
 Signs = tuple[int, int]
 """Signs of axis0 and axis1; -1: the motor counts down where the differential counts up."""

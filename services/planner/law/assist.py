@@ -77,6 +77,11 @@ class AssistState(msgspec.Struct):
     integral: float = 0.0
     """N"""
 
+    @property
+    def assist(self) -> float:
+        """Assist force in the feedforward, N."""
+        return (self.ramp or 0.0) + self.integral
+
 
 class AssistLaw:
     """Assist force: the rate-limited request plus a slow integral on its error.
@@ -101,23 +106,20 @@ class AssistLaw:
         """Start without assist; the first `advance` adopts the request at once."""
         self._force_max, self._rate_max = config.force_max, config.rate_max
         self._integral_max, self._integral_s = config.integral_max, config.integral_s
-        self.state = AssistState()
 
-    @property
-    def assist(self) -> float:
-        """Assist force in the feedforward, N."""
-        return (self.state.ramp or 0.0) + self.state.integral
-
-    def advance(self, wanted: float, measured: float | None, dt: float, *, still: bool) -> float:
-        """Advance by one tick; return the rate of `assist` in N/s.
+    def advance(
+        self, s: AssistState, wanted: float, measured: float | None, dt: float, *, still: bool
+    ) -> float:
+        """Advance by one tick; return the rate of the assist in N/s.
 
         Args:
+            s: state of the assist, which changes.
             wanted: requested upward force on the operator, N.
             measured: the same force measured at the harness, N; None if not known now.
             dt: time since the last tick, s.
             still: False while the robot holds or the operator leads.
         """
-        s, wanted = self.state, clamp(wanted, 0.0, self._force_max)
+        wanted = clamp(wanted, 0.0, self._force_max)
         if s.ramp is None:
             # a planner that takes over from HOLD finds the assist in HOLD's feedforward
             s.ramp = wanted
@@ -162,20 +164,19 @@ class LeadEasing:
     def __init__(self, alpha: float) -> None:
         """Set alpha in [0, 1); 0 disables the easing."""
         self._alpha = alpha
-        self.state = EasingState()
 
     def ease(
-        self, up: float | None, moment_pitch: float, assist: float, dt: float
-    ) -> tuple[float, float]:
+        self, s: EasingState, up: float | None, moment_pitch: float, assist: float, dt: float
+    ) -> Pair:
         """Return alpha w_h: N along the world's z at the harness, N m about the pitch axis.
 
         Args:
+            s: state of the easing, which changes.
             up: upward force of the operator, N, world; None if not known now: the easing fades.
             moment_pitch: of the operator about the torso's y, N m.
             assist: assist force in the feedforward, N.
             dt: time since the last tick, s.
         """
-        s = self.state
         if up is None:
             s.left = max(0.0, s.left - dt / LEAD_FADE_S)
         else:
@@ -212,11 +213,9 @@ class Overload:
         self._force_max, self._moment_max = config.overload_force, config.overload_moment
         self._after_ns = round(config.overload_after_ms * NS_PER_MS)
         self._release_ns = round(config.overload_release_s * NS_PER_S)
-        self.state = OverloadState()
 
-    def receive(self, wrench: Wrench, now_ns: int) -> None:
-        """Update with a wrench that arrived now."""
-        s = self.state
+    def receive(self, s: OverloadState, wrench: Wrench, now_ns: int) -> None:
+        """Update the state with a wrench that arrived now."""
         load_ratio = max(
             math.hypot(*wrench.force) / self._force_max,
             math.hypot(*wrench.moment) / self._moment_max,

@@ -1,8 +1,8 @@
-"""Computes the coupled torque, which the planner adds to the local gains, low-passed. Pure.
+"""The coupled torque, and all of the law's terms at a reference pose. Pure.
 
-Alone, the local gains stand with K_fail = T^T D T + K_geo (`services.planner.law.certificate`) and
-damp with T^T D_B T. In the closed rows of p, the rest of the body's K_p and B_p (paper, section IV)
-is
+The planner adds the coupled torque, low-passed, to the local gains. Alone, the local gains stand
+with K_fail = T^T D T + K_geo (`services.planner.law.certificate`) and damp with T^T D_B T. In the
+closed rows of p, the rest of the body's K_p and B_p (paper, section IV) is
 
     K_c = (K_p - K_fail)+        B_c = (c B_p - T^T D_B T)+        c: `coupling_damping`
 
@@ -13,15 +13,23 @@ is
 through two poles at `coupling_bandwidth_hz`. The feedback is some milliseconds old and acts on the
 bare rotors of a flexible drivetrain. Without the filter, the robot shook below 40 000 N m/rad and
 fell. `tools.lab.design.dynamic_certificate` computes which bandwidth and damping are safe.
+
+`LawAtReference` computes local gains and coupled torque at a pose (paper, section IV), for the
+planner's tick and for `xrl log explain` (`tools.lab.design.torque_breakdown`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
+from services.planner.law.reference import Reference
 from services.planner.law.small_matrices import positive_part
+from services.planner.law.split import GainLaw, GainSplit, JointGains, LocalGains
 from shared.arrays import Array
 from shared.clamp import clamp
 from shared.config.sections import LawConfig
@@ -101,63 +109,90 @@ class PushIntegral:
         gain: rate of the force per error, N/(m s); 0: the direction is led, or the split the
             paper's. The dynamic certificate holds for any limit.
         most: the limit, N.
-        force: F_I, N.
     """
 
     def __init__(self, law: LawConfig) -> None:
-        """Start at rest."""
+        """Set rate and limit."""
         closed = law.split == "certified" and not law.S[Y]
         self.gain = law.K_p[Y] / law.push_integral_s if closed else 0.0
         self.most = law.push_integral_max if closed else 0.0
-        self.force = 0.0
 
-    def advance(self, error: float, rate: float, dt: float) -> None:
-        """Integrate for dt seconds, within the limit.
+    def after(self, force: float, error: float, rate: float, dt: float) -> float:
+        """Return F_I after dt seconds, N.
 
         Args:
+            force: F_I before, N.
             error: of y, m.
             rate: of the error, m/s.
             dt: time since the last tick, s.
         """
         slow = max(0.0, 1.0 - abs(rate) / FAST)
-        self.force = clamp(self.force + dt * slow * self.gain * error, -self.most, self.most)
+        return clamp(force + dt * slow * self.gain * error, -self.most, self.most)
 
 
-class CoupledTorque:
-    """tau_coupled: the body's request with its integral, through a low-pass with two equal poles.
+class CouplingState(msgspec.Struct):
+    """State of the coupled torque."""
 
-    Attributes:
-        integral: F_I.
+    first: tuple[float, ...] = (0.0,) * N_JOINTS
+    """Output of the low-pass's first pole, N m."""
+    second: tuple[float, ...] = (0.0,) * N_JOINTS
+    """Output of its second pole, N m."""
+    push: float = 0.0
+    """F_I, N."""
+
+
+def low_passed(s: CouplingState, tau: Array, bandwidth_hz: float, dt: float) -> Array:
+    """Return tau_coupled (12,), N m, after two equal poles: docs/law.md (18).
+
+    Args:
+        s: both poles, which change.
+        tau: unfiltered (12,), N m.
+        bandwidth_hz: of each pole.
+        dt: time since the last tick, s.
     """
+    gain = pole_gain(bandwidth_hz, dt)
+    first, second = np.array(s.first), np.array(s.second)
+    first += gain * (tau - first)
+    second += gain * (first - second)
+    s.first, s.second = tuple(first.tolist()), tuple(second.tolist())
+    return second
 
-    def __init__(self, bandwidth_hz: float, integral: PushIntegral) -> None:
-        """Start at rest."""
-        self.integral = integral
-        self._bandwidth_hz = bandwidth_hz
-        self._first: Array = np.zeros(N_JOINTS)
-        self._second: Array = np.zeros(N_JOINTS)
 
-    def advance(self, tau: Array, dt: float) -> Array:
-        """Return the filtered torque (12,), N m: docs/law.md (18).
+class LawTerms(NamedTuple):
+    """One tick's gains, and its coupled torque before any filter."""
+
+    body_gains: Callable[[], JointGains]
+    """Computes K_q and B_q of all the body; the certified split does not need them."""
+    local: LocalGains
+    """D and D_B, certified."""
+    coupled: Array
+    """J^T [K_c e_p + B_c e_pdot] (12,), N m, which the planner adds to the local gains."""
+
+
+class LawAtReference:
+    """The law's terms at a pose, without state."""
+
+    def __init__(self, gains: GainLaw, split: GainSplit) -> None:
+        """Set the body's gains and how they are split."""
+        self._gains, self._split = gains, split
+        self._uncoupled = UncoupledGains(gains.K_p, gains.B_p, gains.S, split.coupling.damping)
+
+    def evaluate(self, reference: Reference, e_p: Array, e_pdot: Array) -> LawTerms:
+        """Return the terms: docs/law.md (9).
 
         Args:
-            tau: unfiltered (12,), N m.
-            dt: time since the last tick, s.
+            reference: evaluated at the reference pose.
+            e_p: p_ref - p (6,), m and rad.
+            e_pdot: pdot_ref - pdot (6,), m/s and rad/s.
         """
-        gain = pole_gain(self._bandwidth_hz, dt)
-        self._first += gain * (tau - self._first)
-        self._second += gain * (self._first - self._second)
-        return self._second.copy()
+        T, p, inputs = reference.T, reference.p, reference.inputs
 
-    def reset(self) -> None:
-        """Reset filter and integral to zero."""
-        self._first[:] = self._second[:] = self.integral.force = 0.0
+        def body_gains() -> JointGains:
+            F = self._gains.K_p * e_p + self._gains.B_p * e_pdot + inputs.F_O
+            kinematics = reference.kinematics()
+            return self._gains.gains(kinematics, kinematics.hessian_times(F, inputs.F_assist))
 
-    def snapshot(self) -> tuple[float, ...]:
-        """Return both poles' states (24,), N m, and F_I, N."""
-        return (*self._first.tolist(), *self._second.tolist(), self.integral.force)
-
-    def restore(self, state: tuple[float, ...]) -> None:
-        """Continue from a state that `snapshot` returned."""
-        self._first[:], self._second[:] = state[:N_JOINTS], state[N_JOINTS : 2 * N_JOINTS]
-        self.integral.force = state[2 * N_JOINTS]
+        local = self._split.split(body_gains, float(p[2]), float(p[4]), T, reference.hessian_O)
+        K_fail = self._split.certificate.failsafe_stiffness(local.D)
+        K_c, B_c = self._uncoupled.at(K_fail, (T.T * local.D_B) @ T)
+        return LawTerms(body_gains, local, (K_c @ e_p + B_c @ e_pdot) @ reference.J)

@@ -60,10 +60,20 @@ class LoadState(msgspec.Struct):
     b: float = 0.0
     """N m along pitch, for a load below (+) or above it, with the torso at 90 degrees."""
     rates: Pair | None = None
+    """At the last estimate; None while it pauses: a state is stale, or a leg hides the load."""
     refused: bool = False
     weighing_s: float = 0.0
     looked: bool = False
     """It has looked whether the robot hangs, once."""
+
+    @property
+    def blocks(self) -> bool:
+        """True while the load differs too much from the file, or is not known yet."""
+        return self.refused or self.weighing_s > 0.0
+
+    def moment(self, pitch: float) -> float:
+        """Return the moment of the surplus load about the harness point, N m, at a pitch, rad."""
+        return self.a * math.cos(pitch) + self.b * math.sin(pitch)
 
 
 class Load:
@@ -81,20 +91,12 @@ class Load:
         self._kg_max, self._moment_max = correction_max
         self.enabled = any(correction_max)
         self._weight, self._mass, self.inertia = weight, mass, inertia
-        self.state = LoadState()
 
-    @property
-    def refused(self) -> bool:
-        """True while the load differs too much from the file, or is not known yet."""
-        s = self.state
-        return s.refused or s.weighing_s > 0.0
-
-    def refusal(self) -> str:
+    def refusal(self, s: LoadState) -> str:
         """Return why the load is refused and how to fix it, as text; "" if it is accepted."""
-        s = self.state
         if not s.refused:
             return "its load is being weighed" if s.weighing_s > 0.0 else ""
-        if self._is_hung:
+        if self._is_hung(s):
             return (
                 "it hangs: lower it until its feet bear its weight; or, on its feet, it carries "
                 f"{-s.kg:.0f} kg less than its file says: set mass.payload, then `xrl gains`"
@@ -119,21 +121,21 @@ class Load:
                 )
         return "; ".join(reasons)
 
-    def force(self) -> float:
+    def force(self, s: LoadState) -> float:
         """Return the part of the weight beyond friction, N at the harness point; limited."""
-        s = self.state
         return _deadband(GRAVITY * s.kg, FRICTION_BAND[0], GRAVITY * self._kg_max)
 
-    def moment(self, pitch: float) -> float:
+    def moment(self, s: LoadState, pitch: float) -> float:
         """Return the part of its pitch moment beyond friction, N m, within the limit."""
-        return _deadband(self._moment(pitch), FRICTION_BAND[1], self._moment_max)
+        return _deadband(s.moment(pitch), FRICTION_BAND[1], self._moment_max)
 
     def advance(
-        self, F: Array, n: Array, pitch: float, rates: Pair, dt: float, *, led: bool
+        self, s: LoadState, F: Array, n: Array, pitch: float, rates: Pair, dt: float, *, led: bool
     ) -> None:
         """Update with the wrench that joints and person hold up.
 
         Args:
+            s: state of the estimate, which changes.
             F: wrench along p (6,), N and N m, world.
             n: rise of the harness point along p (6,), m/m and m/rad.
             pitch: of the torso, rad.
@@ -141,10 +143,9 @@ class Load:
             dt: time since the last call, s.
             led: the planner is engaged.
         """
-        s = self.state
         before, s.rates = s.rates, rates
         surplus = float(F[2]) - self._weight
-        if self._hangs_at_start(surplus, led=led) or before is None:
+        if self._hangs_at_start(s, surplus, led=led) or before is None:
             return
         if led and surplus < (CARRIED_FRACTION - 1.0) * self._weight:
             return
@@ -155,61 +156,50 @@ class Load:
         moment = float(F[4]) - float(n[4]) * GRAVITY * s.kg
         s.kg += min(1.0, dt / pole_s) * (weight / GRAVITY - s.kg)
         s.kg -= self._mass * (rates[0] - before[0]) / (GRAVITY * pole_s)
-        error = dt * (moment - self._moment(pitch)) - self.inertia * (rates[1] - before[1])
+        error = dt * (moment - s.moment(pitch)) - self.inertia * (rates[1] - before[1])
         error /= pole_s
         s.a += error * math.cos(pitch)
         s.b += error * math.sin(pitch)
-        if not led and self._is_hung:
+        if not led and self._is_hung(s):
             s.weighing_s = WEIGHING_S
-        scale = RESUME_FRACTION if self.refused else 1.0
+        scale = RESUME_FRACTION if s.blocks else 1.0
         moment = max(abs(s.a), abs(s.b))
         s.refused = abs(s.kg) > scale * self._kg_max or moment > scale * self._moment_max
         if s.weighing_s > 0.0:
             s.weighing_s = WEIGHING_S if s.refused else max(0.0, s.weighing_s - dt)
 
-    def pause(self) -> None:
-        """Pause the estimate: a state is stale, or a straight or folded leg hides the load."""
-        self.state.rates = None
-
-    def advance_without_harness(self, F_z: float, dt: float, *, led: bool) -> None:
+    def advance_without_harness(self, s: LoadState, F_z: float, dt: float, *, led: bool) -> None:
         """Update with the joints' force along z, N, without a harness; check only if it hangs.
 
         Without a harness a load cannot be distinguished from a hand. Once the robot is lowered, the
         file's load is accepted.
         """
-        s = self.state
         surplus, s.rates = F_z - self._weight, None
-        if self._hangs_at_start(surplus, led=led) or s.weighing_s == 0.0:
+        if self._hangs_at_start(s, surplus, led=led) or s.weighing_s == 0.0:
             return
         s.kg += min(1.0, dt / HOLDING_S) * (surplus / GRAVITY - s.kg)
-        if not self._is_hung:
+        if not self._is_hung(s):
             s.refused, s.weighing_s = False, 0.0
             s.kg = s.a = s.b = 0.0
 
-    @property
-    def _is_hung(self) -> bool:
-        s = self.state
+    def _is_hung(self, s: LoadState) -> bool:
         return GRAVITY * s.kg < (HANGING_FRACTION - 1.0) * self._weight
 
-    def _hangs_at_start(self, surplus: float, *, led: bool) -> bool:
+    def _hangs_at_start(self, s: LoadState, surplus: float, *, led: bool) -> bool:
         """Return True at the first update of a robot that hangs.
 
         From then on it is weighed, and the planner does not engage before the load is known.
 
         Args:
+            s: state of the estimate, which changes.
             surplus: force on the feet beyond the file's weight, N.
             led: the planner is engaged.
         """
-        s = self.state
         first, s.looked = not s.looked, True
         hangs = first and not led and surplus < (HANGING_FRACTION - 1.0) * self._weight
         if hangs:
             s.kg, s.refused, s.weighing_s = surplus / GRAVITY, True, WEIGHING_S
         return hangs
-
-    def _moment(self, pitch: float) -> float:
-        s = self.state
-        return s.a * math.cos(pitch) + s.b * math.sin(pitch)
 
 
 def _deadband(value: float, width: float, limit: float) -> float:

@@ -79,8 +79,6 @@ class Reference:
             self.hessian_O, self.gravity, self.assist, self.dtau_ff,
         ) = self._graph.results  # fmt: skip
         self.q: Array = np.zeros(12)
-        self.start: Array = np.zeros(12)
-        """Joint angles (12,), rad, from which the next `solve` begins."""
 
     def load(
         self, pdot_ref: Array, F_O: Array, F_assist: Array, assist_rate: Array, D_left: Array
@@ -94,14 +92,15 @@ class Reference:
         inputs.F_assist[:], inputs.assist_rate[:] = F_assist, assist_rate
         inputs.D_left[:] = D_left
 
-    def solve(self, p_ref: Array) -> IkResult:
-        """Solve q = IK(p_ref) from `start`, and evaluate all arrays there: docs/law.md (7).
+    def solve(self, start: Array, p_ref: Array) -> IkResult:
+        """Solve q = IK(p_ref), and evaluate all arrays there: docs/law.md (7).
 
         Args:
+            start: joint angles (12,), rad, from which it begins.
             p_ref: (6,), m and rad.
         """
         inputs = self.inputs
-        inputs.q[:], inputs.p_ref[:] = self.start, p_ref
+        inputs.q[:], inputs.p_ref[:] = start, p_ref
         for iterations in range(1, STEPS_MAX + 1):
             self._graph()
             largest, beyond = self._check.tolist()
@@ -112,22 +111,23 @@ class Reference:
                 return IkResult(iterations, largest * largest)
             inputs.q[:] = self._q_next
         ik = self._ik
-        ik.q[:], ik.kinematics.stance[:] = self.start, inputs.stance
+        ik.q[:], ik.kinematics.stance[:] = start, inputs.stance
         result = ik.solve(p_ref, inputs.D_left)
         self.evaluate(ik.q)
         return result
 
-    def expect(self, dt: float) -> None:
-        """Begin the next `solve` where the reference will be in dt, s, if it goes on as it does.
+    def expected(self, dt: float) -> Array:
+        """Return where the reference will be in dt, s, if it goes on as it does (12,), rad.
 
         Inside the joint limits, as the solver's own solutions are.
         """
-        np.multiply(self.v, dt, out=self.start)
-        self.start += self.q
-        if not np.isfinite(self.start).all():
-            self.start[:] = self.q
-        np.maximum(self.start, self.inputs.low, out=self.start)
-        np.minimum(self.start, self.inputs.high, out=self.start)
+        start: Array = self.v * dt
+        start += self.q
+        if not np.isfinite(start).all():
+            start[:] = self.q
+        np.maximum(start, self.inputs.low, out=start)
+        np.minimum(start, self.inputs.high, out=start)
+        return start
 
     def evaluate(self, q: Array) -> None:
         """Take q (12,), rad, for the reference, and evaluate all arrays there."""

@@ -1,9 +1,13 @@
-"""Gain split: the part of K_q and B_q that the joint services hold alone (docs/law.md#gain-split).
+"""Joint gains of the whole body, and the part of them that the joint services hold alone. Pure.
 
+Joint stiffness and damping of the whole body are (paper section III)
+
+    K_q = N K_0 + J^T K_p J - sum_i H_i F_i,    B_q = N B_0 + J^T B_p J,    N = I - J^+ J.
+
+The split gives the joint services the part that they hold alone (docs/law.md#gain-split).
 `certified` takes D from the schedule computed offline; `diagonal` is the paper's diag(K_q). In both
 cases the certificate checks the gains. Where D misses the margin, the split stiffens D towards
 certified gains. If no step meets the margin, the source is UNCERTIFIED and the robot must hold.
-Pure.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from services.planner.law.certificate import Certificate, Margins
-from services.planner.law.gains import JointGains
+from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
 from shared.bus.messages import SplitSource
 from shared.clamp import clamp
@@ -24,6 +28,45 @@ from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 from shared.joints import MODULES, N_JOINTS
+
+
+class JointGains(NamedTuple):
+    """Whole-body joint gains."""
+
+    K_q: Array
+    """(12, 12) N m/rad, symmetric."""
+    B_q: Array
+    """(12, 12) N m s/rad, symmetric."""
+
+
+class GainLaw:
+    """Gains at one configuration."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Filter K_p and B_p by S_perp: no stiffness in the directions that the operator leads."""
+        law = config.law
+        self.S: Array = np.array(law.S, dtype=float)
+        closed = 1.0 - self.S
+        self.K_p: Array = np.array(law.K_p) * closed
+        self.B_p: Array = np.array(law.B_p) * closed
+        self._K_0, self._B_0 = law.K_0, law.B_0
+        self._damping = law.damping_lambda**2 * np.eye(6)
+        self._identity = np.eye(N_JOINTS)
+
+    def gains(self, kinematics: Kinematics, hessian_F: Array) -> JointGains:
+        """Return the gains: docs/law.md (10) and (11).
+
+        Args:
+            kinematics: updated at the configuration.
+            hessian_F: sum_i H_i F_i (12, 12), N m/rad.
+        """
+        J = kinematics.J
+        # damped, because the plain pseudo-inverse jumps at a straight knee
+        N = self._identity - J.T @ np.linalg.solve(J @ J.T + self._damping, J)
+        K_q = self._K_0 * N + (J.T * self.K_p) @ J - hessian_F
+        B_q = self._B_0 * N + (J.T * self.B_p) @ J
+        return JointGains(0.5 * (K_q + K_q.T), 0.5 * (B_q + B_q.T))
+
 
 STIFFEN_FRACTIONS: Final = (0.25, 0.5, 0.75, 1.0)
 """Fractions of the way from the wanted D to the stiff one, tried in turn."""

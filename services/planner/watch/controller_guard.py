@@ -66,18 +66,18 @@ class ControllerGuard:
         half = geometry.l_foot / 2, (geometry.w_base + geometry.w_foot) / 2
         self._room = SUPPORT * half[0], SUPPORT * half[1]
         self._controller, self._law = controller, law
-        self.state = GuardState()
         self._begun = False
 
-    def act(self, seen: Observation, *, leads: bool) -> LawOutput:
+    def act(self, state: GuardState, seen: Observation, *, leads: bool) -> LawOutput:
         """Return the tick's output.
 
         Args:
+            state: of this guard, which changes.
             seen: at this tick; its `time_s` is set here.
             leads: the planner leads; else the controller is reset, and the shipped law's output is
                 returned, which starts at the measured pose.
         """
-        law, state = seen.law, self.state
+        law = seen.law
         state.time_s = state.time_s + seen.dt if leads else 0.0
         if state.failed:
             return _uncertified(law)
@@ -87,7 +87,7 @@ class ControllerGuard:
                 self._controller.reset(shown)
                 self._begun = True
             if not leads:
-                return self._rested(seen)
+                return self._rested(state, seen)
             action = self._controller.step(shown)
             fault = fault_of(action)
         except Exception as error:  # noqa: BLE001 - whatever somebody's code brings about
@@ -112,9 +112,8 @@ class ControllerGuard:
             local=local,
         )
 
-    def _rested(self, seen: Observation) -> LawOutput:
+    def _rested(self, state: GuardState, seen: Observation) -> LawOutput:
         """Return the shipped law's output; after an objection all hold until it is calm."""
-        state = self.state
         if state.why:
             x, y = capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope)
             calm = abs(x) <= CALM * self._room[0] and abs(y) <= CALM * self._room[1]

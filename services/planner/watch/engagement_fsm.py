@@ -1,25 +1,38 @@
-"""Decides when all six modules track and when they hold (docs/architecture.md#modes).
+"""Decides who leads, when all six modules track, and which of them stiffen. Pure.
 
-All six modules track or none does. While one module's state is stale, or one module is not in
-TRACK, every command carries `hold`, so that no leg works against the other. Modules report `ready`
-once commands have been fresh for long enough. When all are ready, the planner engages: it lifts
-`hold` for all in the same tick, and they have `GRACE_NS` to report TRACK. An overload at the
-harness and gains that do not stand alone also set `hold`.
+**Engagement** (docs/architecture.md#modes). All six modules track or none does. While one module's
+state is stale, or one module is not in TRACK, every command carries `hold`, so that no leg works
+against the other. Modules report `ready` once commands have been fresh for long enough. When all
+are ready, the planner engages: it lifts `hold` for all in the same tick, and they have `GRACE_NS`
+to report TRACK. An overload at the harness and gains that do not stand alone also set `hold`.
 
 After a drop-out of any module, a trip, or gains that do not stand alone, the planner waits before
 it re-engages; the wait grows with the number of recent drop-outs. Six links that drop out in turn
-would otherwise make the robot flap between TRACK and HOLD. Pure: state, inputs -> outputs.
+would otherwise make the robot flap between TRACK and HOLD.
+
+**Two planners** on one bus, by accident: the one that is followed leads on, the other waits. A
+module takes another planner's commands once those of the present one are too old. A second planner
+that sends takes one module after the other, each at the first message that comes late. So a planner
+that sees modules follow another one leads none until that one has ended. It makes itself known by
+commands that every module refuses: `xrl status` and the log then tell of both.
+
+**Limp legs.** Modules are to stiffen when another one may be limp. Joint services on one host
+detect a limp neighbour without a planner (`services.joint.neighbours`). The planner adds modules on
+other hosts, and a module that restarts and stays DISARMED.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
 
-from shared.bus.messages import Mode, PlannerMode
-from shared.clock import NS_PER_S
-from shared.robot.hold_rules import Dropouts
+from shared.bus.messages import DriveStatus, JointState, Mode, PlannerMode, Refusal
+from shared.clock import NS_PER_MS, NS_PER_S
+from shared.joints import N_MODULES
+from shared.robot.hold_rules import SUPPORT_FOR, Dropouts, Support
 
 GRACE_NS = 150_000_000
 """ns; after `hold` is lifted, modules may take this long to report TRACK."""
@@ -114,3 +127,116 @@ class Engagement(msgspec.Struct):
     def hold(self) -> bool:
         """True if every command is to carry `hold`."""
         return self.mode is not _LEADING
+
+
+AGAIN_NS: Final = 500 * NS_PER_MS
+"""Age of another planner's newest command from which one that nobody follows may lead: younger, the
+other may only have been held up."""
+
+
+ANNOUNCE_NS: Final = 200 * NS_PER_MS
+"""Within the window of `xrl status`."""
+
+
+class RivalWatch(msgspec.Struct):
+    """What a planner knows of another one."""
+
+    yields: bool = False
+    """True while this planner leads no module."""
+    session: int = 0
+    """Session of the other planner; 0 if none was seen."""
+    announced_ns: int = 0
+    """When this planner, as it yields, last made itself known."""
+
+    def advance(self, own: int, states: Sequence[JointState], age_max_ns: int) -> bool:
+        """Advance by one tick.
+
+        Args:
+            own: this planner's session; the one below it was its own before.
+            states: of the modules that have sent one lately.
+            age_max_ns: a module with an older command holds.
+
+        Returns:
+            True if this planner has to go on in a new session: a module has retired its own for
+            another's, and refuses it for good.
+        """
+        if all(state.session == own for state in states):  # as in nearly every tick
+            self.yields = False
+            return False
+        mine = (own, own - 1)
+        followed = any(state.session in mine and _is_in_use(state, age_max_ns) for state in states)
+        within_ns = age_max_ns if followed else AGAIN_NS
+        follow = Counter(
+            state.session for state in states if state.session and _is_in_use(state, within_ns)
+        )
+        own_count = sum(follow.pop(session, 0) for session in mine)
+        # of planners with equally many modules, as after a start at the same time, one goes on
+        rival, count = min(follow.items(), key=lambda row: (-row[1], row[0]), default=(0, 0))
+        self.session = rival or self.session
+        self.yields = count > 0 and (count, -rival) > (own_count, -own)
+        return not self.yields and any(
+            state.refusal == Refusal.FOREIGN_SESSION
+            and state.refused_session == own
+            and state.session not in mine
+            and not _is_in_use(state, age_max_ns)
+            for state in states
+        )
+
+    def announces(self, now_ns: int) -> bool:
+        """Return True if a planner that yields is to make itself known now."""
+        due = now_ns - self.announced_ns >= ANNOUNCE_NS
+        if due:
+            self.announced_ns = now_ns
+        return due
+
+    def describe(self) -> str:
+        """Return what to say while it yields; else nothing."""
+        if not self.yields:
+            return ""
+        return (
+            f"another planner leads (session {self.session}), and this one waits; end one of them: "
+            "this one goes on when the other has ended"
+        )
+
+
+def _is_in_use(state: JointState, age_max_ns: int) -> bool:
+    return 0 <= state.age_ns <= age_max_ns
+
+
+DISARMED_NS: Final = 200 * NS_PER_MS
+"""ns; a module DISARMED for this long is not about to take its drive over."""
+
+# Compared in each tick, for six modules: docs/contributing.md, The control path.
+_DISARMED, _FAULT, _HOLDING = Mode.DISARMED, Mode.FAULT, DriveStatus.HOLDING
+
+
+class LimpLegWatch(msgspec.Struct):
+    """Times since which each module is DISARMED while its drive does not hold."""
+
+    since_ns: tuple[int, ...] = (0,) * N_MODULES
+    """0 if it is not."""
+
+    def advance(self, now_ns: int, states: Sequence[JointState]) -> Support:
+        """Return which modules are to stiffen.
+
+        FAULT counts in any state of the drive: a drive that does not reply may hold, or have no
+        power.
+
+        Args:
+            now_ns: the planner's clock.
+            states: the newest of each module, of any age.
+        """
+        self.since_ns = tuple(
+            (since_ns or now_ns) if _is_down(state) else 0
+            for since_ns, state in zip(self.since_ns, states, strict=True)
+        )
+        support = Support.NONE
+        for state, since_ns, wanted in zip(states, self.since_ns, SUPPORT_FOR, strict=True):
+            persists = since_ns > 0 and now_ns - since_ns >= DISARMED_NS
+            if persists or state.mode == _FAULT:
+                support = max(support, wanted)
+        return support
+
+
+def _is_down(state: JointState) -> bool:
+    return state.mode == _DISARMED and state.drive != _HOLDING

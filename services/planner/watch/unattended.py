@@ -12,11 +12,11 @@ compared with c, the rate at which the hand left, which falls at least by `COAST
     excess'  = rate - c;                           excess = 0 while a hand is felt
     released   if |excess + STOP_S (rate - c)| > RUNAWAY
 
-A released direction is closed (`services.planner.law.height`) until a hand is back. A hand that
-was there after all, too light to be felt, then feels a resistance and opens it. A pitch that stays
-released for `PROOF_NS` shows that nobody holds the robot: its height is then closed as well, and
-the weight of a person who rests no longer moves it. A hand on the pitch opens both. What moves
-nevertheless is drift, which trips:
+A released direction is closed (`services.planner.law.closed_reference`) until a hand is back. A
+hand that was there after all, too light to be felt, then feels a resistance and opens it. A pitch
+that stays released for `PROOF_NS` shows that nobody holds the robot: its height is then closed as
+well, and the weight of a person who rests no longer moves it. A hand on the pitch opens both. What
+moves nevertheless is drift, which trips:
 
     drift    = max(|z - z0|, ARM |pitch - pitch0|)       z0, pitch0: when the hand was lost
 """
@@ -28,7 +28,7 @@ from typing import Final
 
 import msgspec
 
-from services.planner.law.height import Released
+from services.planner.law.closed_reference import Released
 from shared.bus.messages import Pair
 from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -73,8 +73,8 @@ class OpenDirection(msgspec.Struct):
     """Time since which a hand has been back on it; 0 if it is not."""
 
 
-class UnattendedState(msgspec.Struct):
-    """State of `Unattended`."""
+class Unattended(msgspec.Struct):
+    """Pose and rates at which a hand was last felt."""
 
     felt_ns: int = 0
     """Time at which a hand was last felt."""
@@ -90,16 +90,9 @@ class UnattendedState(msgspec.Struct):
         """True if nobody leads the height, the pitch."""
         return self.height.released_ns > 0, self.pitch.released_ns > 0
 
-
-class Unattended:
-    """Keeps the pose and the rates at which a hand was last felt."""
-
-    def __init__(self) -> None:
-        self.state = UnattendedState()
-
     def describe(self) -> str:
         """Return that nobody leads, in words; "" if somebody does."""
-        if not any(self.state.released):
+        if not any(self.released):
             return ""
         return "nobody leads it: it stays where it is until a hand moves it"
 
@@ -114,27 +107,26 @@ class Unattended:
                 if not known, which counts as a hand.
             leads: the planner is engaged; otherwise nothing is open, and nothing is released.
         """
-        s = self.state
-        dt = (now_ns - s.last_ns) / NS_PER_S if s.last_ns else 0.0
-        s.last_ns = now_ns
-        for i, direction in enumerate((s.height, s.pitch)):
+        dt = (now_ns - self.last_ns) / NS_PER_S if self.last_ns else 0.0
+        self.last_ns = now_ns
+        for i, direction in enumerate((self.height, self.pitch)):
             _coast(direction, rates[i], dt, felt=not abs(hand[i]) < TOUCH_MIN[i])
             beyond = rates[i] - direction.coast
             if not leads or _is_back(direction, now_ns, hand[i], HAND_BACK[i]):
                 direction.released_ns = 0
-                if direction is s.pitch:  # the height was closed because nobody held the pitch
-                    s.height.released_ns = 0
+                if direction is self.pitch:  # the height was closed because nobody held the pitch
+                    self.height.released_ns = 0
             elif not direction.released_ns and abs(direction.excess + STOP_S * beyond) > RUNAWAY[i]:
                 direction.released_ns = now_ns
                 direction.drive = 0.5 * beyond * beyond / (direction.excess or math.inf)
-        pitch_ns = s.pitch.released_ns
+        pitch_ns = self.pitch.released_ns
         if pitch_ns and now_ns - pitch_ns >= PROOF_NS:
-            s.height.released_ns = s.height.released_ns or now_ns
+            self.height.released_ns = self.height.released_ns or now_ns
         if not (abs(hand[0]) < HAND_MIN[0] and abs(hand[1]) < HAND_MIN[1]):
-            s.felt_ns = now_ns
-        if s.left is None or now_ns - s.felt_ns <= HAND_LOST_NS:
-            s.left = pose
-        return max(abs(pose[0] - s.left[0]), ARM * abs(pose[1] - s.left[1]))
+            self.felt_ns = now_ns
+        if self.left is None or now_ns - self.felt_ns <= HAND_LOST_NS:
+            self.left = pose
+        return max(abs(pose[0] - self.left[0]), ARM * abs(pose[1] - self.left[1]))
 
 
 def _coast(direction: OpenDirection, rate: float, dt: float, *, felt: bool) -> None:

@@ -34,9 +34,8 @@ from services.simulator.drives.axis_faults import (
 )
 from services.simulator.drives.axis_heat import AxisHeat, Heat
 from services.simulator.drives.axis_settings import configured
-from services.simulator.drives.axis_watchdogs import Watchdogs
+from services.simulator.drives.axis_watches import Spinout, Watchdogs
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
-from services.simulator.drives.spinout import Spinout
 from shared.can.cansimple import (
     AxisError,
     AxisState,
@@ -223,7 +222,7 @@ class AxisBank:
         self._control.hold_here(axis)
 
     def set_count(self, axis: int, count: float) -> None:
-        """Tell an axis that its encoder reads so many counts here; `input_pos` stays."""
+        """Set an axis's count at its present position; `input_pos` stays."""
         self._encoders.set_count(axis, count)
 
     def clear_errors(self, axis: int) -> None:

@@ -79,7 +79,7 @@ class _Task(msgspec.Struct):
     """The encoder's."""
     locked_count: int = 0
     total: int = 0
-    """Sum of counts over the scan, of so many samples."""
+    """Sum of counts over the scan's samples."""
     samples: int = 0
 
 

@@ -31,7 +31,7 @@ from services.simulator.drives.axis_settings import (
     PHASE_RESISTANCE,
     Settings,
 )
-from services.simulator.drives.spinout import BANDWIDTH
+from services.simulator.drives.axis_watches import BANDWIDTH
 from shared.can.cansimple import ControlMode
 from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph

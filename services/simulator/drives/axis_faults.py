@@ -14,10 +14,9 @@ import math
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
-from services.simulator.drives.axis_encoders import AxisEncoders
+from services.simulator.drives.axis_encoders import AxisEncoders, Words
 from services.simulator.drives.axis_heat import AxisHeat
 from services.simulator.drives.axis_settings import N_DRIVES
-from services.simulator.drives.odd_encoder import Words
 from shared.can.cansimple import (
     AxisError,
     ControllerError,
@@ -121,7 +120,7 @@ BUS_FAULTS: Final[Mapping[str, AxisErrors]] = {
 TALKS_S: Final = 0.02
 """s from power to the first frame."""
 BOOT_S: Final = 1.54
-"""s from power to the start of the axes: so long the currents' zeros are measured."""
+"""s from power to the start of the axes; the firmware measures the currents' zeros meanwhile."""
 
 
 class Conditions:

@@ -277,7 +277,7 @@ class FibreFront:
         self._version_id = self._crc << 16 | crc16(self._crc, self.descriptor)
 
     def answer(self, packet: bytes) -> bytes | None:
-        """Carry out one request; return the answer, None if there is none."""
+        """Carry out one request; return the answer, or None."""
         if len(packet) < _HEADER.size + _U16.size:
             self.ignored += 1
             return None

@@ -84,7 +84,7 @@ class FibrePort:
 class FibreHub:
     """All USB plugs of one simulator.
 
-    While nobody is connected a poll costs nearly nothing: the plugs have waited for longer.
+    Without a client a poll costs nearly nothing: the plugs have waited for longer.
     """
 
     def __init__(self, ports: Sequence[FibrePort]) -> None:

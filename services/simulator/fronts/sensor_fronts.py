@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from services.simulator.physics.plant import ImuErrors
 from services.simulator.physics.world import World
-from shared.can import imu_can, loadcell_can
+from shared.can.sensor_frames import pack_forces, pack_imu
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import ImuConfig
 from shared.robot import stewart
@@ -65,7 +65,7 @@ class HarnessFront:
         np.maximum(forces, -self._leg_force_max, out=forces)
         np.minimum(forces, self._leg_force_max, out=forces)
         self._hub.poll()  # a load cell takes no requests, but clients that listen must be admitted
-        self._hub.broadcast(loadcell_can.pack(forces.tolist()))
+        self._hub.broadcast(pack_forces(forces.tolist()))
 
 
 class ImuFront:
@@ -91,7 +91,7 @@ class ImuFront:
         back = (w, -x, -y, -z)
         _, *rate = _product(back, _product((0.0, *world.torso_rates()), self._mounting))
         self._hub.poll()
-        self._hub.broadcast(imu_can.pack(measured, rate, valid=True))
+        self._hub.broadcast(pack_imu(measured, rate, valid=True))
 
 
 def _about(axis: int, angle: float) -> list[float]:

@@ -215,7 +215,7 @@ def accept(listener: socket.socket) -> socket.socket | None:
 
 
 def _clear_stale(path: Path, what: str) -> None:
-    """Remove a socket file that nobody listens on; refuse one in use or no socket at all."""
+    """Remove a dead socket file; refuse one in use, and a file that is no socket."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:

@@ -9,8 +9,7 @@ import msgspec
 import numpy as np
 
 from services.simulator.physics.body import Body
-from services.simulator.physics.led_hand import LedHand
-from services.simulator.physics.operator import HandForce, Operator, Wearer
+from services.simulator.physics.operator import HandForce, LedHand, Operator, Wearer
 from shared.arrays import Array
 from shared.bus.messages import Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at

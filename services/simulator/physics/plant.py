@@ -136,7 +136,7 @@ class Person(Section, frozen=True):
     load_scale: Annotated[float, Range(0.0, 3.0, "1")] = 0.9
     """Fraction of the requested assist that the person rests on the harness."""
     load_lag_s: Annotated[float, Range(0.0, 2.0, "s")] = 0.2
-    """And how late: nobody shifts weight at once."""
+    """Lag of that weight: a person does not shift weight at once."""
 
 
 class PlantConfig(Section, frozen=True):

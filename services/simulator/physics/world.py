@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from services.simulator.physics.actuation import Actuation
 from services.simulator.physics.body import Body, FootPlacement
-from services.simulator.physics.led_hand import LedHand
+from services.simulator.physics.operator import LedHand
 from services.simulator.physics.outside import OutsideForces, Torso
 from services.simulator.physics.posture import as_vector, measure_posture, sole_loads
 from shared.arrays import Array

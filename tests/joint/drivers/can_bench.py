@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import time
 from collections import deque
@@ -10,10 +11,11 @@ import can
 import pytest
 
 from services.joint.drivers import can_link, odrive_can
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.joint.drivers.can_link import BUS_OFF
 from services.joint.drivers.frame_times import ARM_GRACE_MS
 from services.joint.drivers.odrive_can import OdriveCan
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import (
     AxisState,
     Command,
@@ -54,19 +56,10 @@ class FakeBus(can.BusABC):
         if self.room == 0:
             raise self.when_full
         self.room -= 1
-        self.sent.append(
-            can.Message(
-                arbitration_id=msg.arbitration_id, data=bytes(msg.data), is_extended_id=False
-            )
-        )
+        self.sent.append(copy.deepcopy(msg))
 
-    def _recv_internal(
-        self,
-        timeout: float | None,  # noqa: ARG002 - python-can's signature
-    ) -> tuple[can.Message | None, bool]:
-        if not self.waiting:
-            return None, True
-        each = self.waiting.popleft()
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:  # noqa: ARG002
+        each = self.waiting.popleft() if self.waiting else None
         if isinstance(each, Exception):
             raise each
         return each, True
@@ -166,9 +159,8 @@ def frame(node: int, command: int, data: bytes = b"", **kwargs: bool) -> can.Mes
 
 
 def error_frame(error_class: int, data: bytes = bytes(8)) -> can.Message:
-    return can.Message(
-        arbitration_id=error_class, data=data, is_error_frame=True, is_extended_id=False
-    )
+    flags = {"is_error_frame": True, "is_extended_id": False}
+    return can.Message(arbitration_id=error_class, data=data, **flags)
 
 
 def error_on_the_wire(bench: Bench) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,17 +13,9 @@ from tests.joint.drivers.rig import Rig, Shed
 
 
 @pytest.fixture
-def path() -> Iterator[Path]:
-    """Return a socket path short enough for the kernel."""
-    directory = Path(tempfile.mkdtemp(dir="/tmp"))
-    yield directory / "can.sock"
-    shutil.rmtree(directory)
-
-
-@pytest.fixture
-def shed(path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Shed]:
+def shed(short_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Shed]:
     """Return what makes emulated drives and drivers."""
-    shed = Shed(path, monkeypatch)
+    shed = Shed(short_dir / "can.sock", monkeypatch)
     yield shed
     shed.close()
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import os
-import struct
 import time
 from collections.abc import Callable, Iterator
 
 import can
 import pytest
 
-from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.can_link import ECHOED, FRAMES_PER_READ, HEARD, RETRY_MS, receiver
 from services.joint.drivers.odrive_can import OdriveCan
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.can.cansimple_06 import Command06
 from shared.clock import NS_PER_MS
@@ -29,16 +28,7 @@ from tests.joint.drivers.can_bench import (
     interface_down,
     receiving_fails,
 )
-from tests.joint.drivers.rig import (
-    DRIVE,
-    MS,
-    NODES,
-    TARGET,
-    Rig,
-    Shed,
-    arm,
-    read,
-)
+from tests.joint.drivers.rig import DRIVE, MS, NODES, TARGET, Rig, Shed, arm, read
 
 TROUBLES = pytest.mark.parametrize(
     ("trouble", "counted"),
@@ -83,23 +73,17 @@ def test_a_bus_that_fails_at_each_attempt_is_tried_now_and_then_and_nothing_rais
 
 @pytest.mark.parametrize("error", [DOWN, can.CanInitializationError("no such device")])
 def test_a_bus_that_cannot_be_opened_is_tried_again(bench: Bench, error: Exception) -> None:
+    """Reading without a bus takes the time that it was given."""
     interface_down(bench)
     bench.after(1)
-    bench.refuses = error
+    bench.refuses, before = error, bench.now_ns
     for _ in range(10):
         assert bench.driver.read(0.05) is not None
+    assert bench.now_ns - before == 500 * NS_PER_MS
     assert len(bench.buses) == 1
     bench.refuses = None
     bench.after(RETRY_MS)
     assert len(bench.buses) == 2
-
-
-def test_reading_without_a_bus_takes_the_time_that_it_was_given(bench: Bench) -> None:
-    error_on_the_wire(bench)
-    bench.after(1)
-    before = bench.now_ns
-    bench.driver.read(0.005)
-    assert bench.now_ns - before == 5 * NS_PER_MS
 
 
 def test_a_bus_that_is_back_at_once_is_gone_on_with_before_the_next_heartbeat(bench: Bench) -> None:
@@ -113,13 +97,6 @@ def test_a_bus_that_is_back_at_once_is_gone_on_with_before_the_next_heartbeat(be
     assert (reading.status, bench.driver.dialect) == (DriveStatus.ARMED, "0.5")
 
 
-@pytest.mark.parametrize("data", [b"", b"\x02", bytes(7)])
-def test_a_foreign_request_for_a_version_is_no_version(bench: Bench, data: bytes) -> None:
-    bench.bus.waiting.append(frame(NODES[0], Command06.GET_VERSION, data))
-    bench.after(1)
-    assert bench.driver.dialect == ""
-
-
 def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(bench: Bench) -> None:
     bench.armed()
     passive = error_frame(0x04, bytes((0, 0x20, 0, 0, 0, 0, 0, 0)))
@@ -129,21 +106,23 @@ def test_trouble_on_the_wire_that_leaves_the_controller_on_it_is_counted_only(be
     assert (bench.driver._link.bus_offs, len(bench.buses)) == (0, 1)
 
 
-def test_an_error_frame_is_not_taken_for_a_frame_of_a_node(bench: Bench) -> None:
-    """Class 0x80 (an error on the bus) has the number of node 4's version."""
+def test_frames_that_only_have_the_number_of_a_nodes_are_not_taken_for_it(bench: Bench) -> None:
+    """An error frame of class 0x80 has that of node 4's version; others are extended or remote.
+
+    A foreign request for a version is none.
+    """
+    for data in (b"", b"\x02", bytes(7)):
+        bench.bus.waiting.append(frame(NODES[0], Command06.GET_VERSION, data))
+        bench.after(1)
+        assert bench.driver.dialect == ""
     bench.receive()
     bench.bus.waiting.append(error_frame(arbitration_id(NODES[0], 0)))
-    bench.after(1)
-    assert bench.driver.dialect == "0.5"
-
-
-def test_extended_and_remote_frames_of_the_same_number_are_not_ours(bench: Bench) -> None:
-    bench.receive()
-    estimate = pack_two_floats(99.0, 0.0)
     for node in NODES:
-        bench.send(node, Command.GET_ENCODER_ESTIMATES, estimate, is_extended_id=True)
-        bench.send(node, Command.GET_ENCODER_ESTIMATES, is_remote_frame=True)
+        for odd in ("is_extended_id", "is_remote_frame"):
+            data = pack_two_floats(99.0, 0.0) if odd == "is_extended_id" else b""
+            bench.send(node, Command.GET_ENCODER_ESTIMATES, data, **{odd: True})
     assert bench.after(1) is None
+    assert bench.driver.dialect == "0.5"
 
 
 def test_a_flooded_bus_does_not_hold_up_the_loop(bench: Bench) -> None:
@@ -198,20 +177,16 @@ def test_writing_to_a_deaf_hub_never_blocks_or_raises(rig: Rig, driver: OdriveCa
     assert list(rig.bank.input_torque[[4, 5]]) == [1.0, 2.0]
 
 
-def test_unknown_interface_is_refused_at_the_start() -> None:
+def test_driver_runs_on_a_bus_with_nothing_but_the_api_of_python_can() -> None:
+    """One that python-can does not know is refused at the start."""
     with pytest.raises(DriveError, match="no_such_bus"):
         OdriveCan(CanConfig(interface="no_such_bus", channel="x"), NODES, DRIVE)
-
-
-def test_driver_runs_on_a_bus_with_nothing_but_the_api_of_python_can() -> None:
     driver = OdriveCan(CanConfig(interface="virtual", channel="test_odrive_can"), NODES, DRIVE)
     with can.Bus(interface="virtual", channel="test_odrive_can", ignore_config=True) as drive_side:
         for node, pos in zip(NODES, (1.0, 2.0), strict=True):
-            idle = struct.pack("<IBBBB", 0, 1, 0, 0, 0x80)
-            drive_side.send(frame(node, Command.HEARTBEAT, idle))
-            drive_side.send(
-                frame(node, Command.GET_ENCODER_ESTIMATES, struct.pack("<ff", pos, -pos))
-            )
+            drive_side.send(frame(node, Command.HEARTBEAT, bytes((0, 0, 0, 0, 1, 0, 0, 0x80))))
+            estimate = pack_two_floats(pos, -pos)
+            drive_side.send(frame(node, Command.GET_ENCODER_ESTIMATES, estimate))
         reading = read(driver)
         driver.write_torque((0.5, -0.5))
         sent = [drive_side.recv(0.5) for _ in range(4)]
@@ -224,9 +199,13 @@ def test_driver_runs_on_a_bus_with_nothing_but_the_api_of_python_can() -> None:
     ]
 
 
-def test_the_kernel_filters_by_the_nodes_to_wake_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench(monkeypatch, "socketcan")
-    found = bench.bus.options["can_filters"]
+def test_the_kernel_filters_by_the_nodes_to_wake_for(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In software a filter saves nothing, and would keep error frames away."""
+    assert "can_filters" not in bench.bus.options
+    kernel = Bench(monkeypatch, "socketcan")
+    found = kernel.bus.options["can_filters"]
     assert isinstance(found, list)
     passing = {
         can_id
@@ -238,15 +217,10 @@ def test_the_kernel_filters_by_the_nodes_to_wake_for(monkeypatch: pytest.MonkeyP
     assert passing == {arbitration_id(node, command) for node in NODES for command in theirs} | {
         arbitration_id(NODES[0], command) for command in ECHOED
     }
-    assert {*bench.driver._takers} <= passing, "what the driver takes must wake it"
-    assert bench.bus.options["receive_own_messages"] is True
+    assert {*kernel.driver._takers} <= passing, "what the driver takes must wake it"
+    assert kernel.bus.options["receive_own_messages"] is True
     assert all(each["extended"] is False for each in found)
-    bench.driver.close()
-
-
-def test_other_interfaces_filter_nothing(bench: Bench) -> None:
-    """In software a filter saves nothing, and would keep error frames away."""
-    assert "can_filters" not in bench.bus.options
+    kernel.driver.close()
 
 
 class QuietBus(FakeBus):
@@ -279,6 +253,7 @@ def quiet() -> Iterator[QuietBus]:
 def test_a_wall_clock_set_back_does_not_hold_up_reading_a_silent_bus(
     quiet: QuietBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """In the kernel; and a frame is read at once."""
     backwards = iter(range(10**9, 0, -3600))
     monkeypatch.setattr("can.bus.time", lambda: next(backwards))
     receive = receiver(quiet, in_kernel=True)
@@ -286,9 +261,7 @@ def test_a_wall_clock_set_back_does_not_hold_up_reading_a_silent_bus(
     assert list(receive(0.01)) == []
     assert time.monotonic() - before > 0.009
     assert next(backwards) == 10**9, "python-can was not asked"
-
-
-def test_a_frame_on_a_bus_in_the_kernel_is_read_at_once(quiet: QuietBus) -> None:
+    monkeypatch.undo()
     quiet.waiting.append(frame(NODES[0], Command.HEARTBEAT, bytes(8)))
     os.write(quiet.ends[1], b"12")
-    assert len(receiver(quiet, in_kernel=True)(5.0)) == 1
+    assert len(receive(5.0)) == 1

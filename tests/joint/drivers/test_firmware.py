@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.firmware import (
     OTHER_ERROR,
     UNANSWERED,
@@ -15,6 +14,7 @@ from services.joint.drivers.firmware import (
     judged,
 )
 from services.joint.drivers.odrive_v3 import AxesStatus
+from shared.bus.messages import DriveStatus
 from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisError, AxisState, Heartbeat
 from shared.can.cansimple_06 import DriveError06, Heartbeat06, ProcedureResult
@@ -61,14 +61,11 @@ def test_a_heartbeat_only_one_dialect_can_send_shows_it(heartbeat: bytes, dialec
     assert dialect_of(heartbeat) == dialect
 
 
-def test_a_version_is_an_answer_of_0_6() -> None:
+def test_a_version_is_an_answer_of_0_6_and_no_reply_to_many_requests_counts_as_0_5() -> None:
     report = report_of((0, new(IDLE)))
     assert report.dialect == ""
     report.receive_version()
     assert report.dialect == "0.6"
-
-
-def test_a_drive_that_never_replies_counts_as_0_5_after_many_requests() -> None:
     report = AxesReport()
     for _ in range(UNANSWERED):
         report.receive(0, old(IDLE, done=False))
@@ -109,45 +106,34 @@ def test_no_error_of_0_6_looks_like_none(bit: int) -> None:
 
 
 def test_every_named_error_of_0_6_has_one_of_0_5() -> None:
-    assert errors_from_06(0) == 0
-    assert errors_from_06(0x8000_0000) == OTHER_ERROR
-    for error in DriveError06:
-        assert errors_from_06(error) < OTHER_ERROR
+    assert (errors_from_06(0), errors_from_06(0x8000_0000)) == (0, OTHER_ERROR)
+    assert all(errors_from_06(error) < OTHER_ERROR for error in DriveError06)
 
 
 def test_the_watchdog_has_its_own_bit_in_each_dialect_and_the_other_one_is_something_else() -> None:
+    """Before anything was written, and armed is wanted, it is no error."""
     watchdog = AxisError.WATCHDOG_TIMER_EXPIRED
-    wanted = {"wanted_armed": True}
-    assert judged("0.5", old(IDLE, 0x800), **wanted) == (IDLE, watchdog)
-    assert judged("0.6", new(IDLE, 0x0100_0000), **wanted) == (IDLE, watchdog)
-    assert judged("0.6", new(IDLE, 0x800), **wanted) == (IDLE, AxisError.MOTOR_FAILED)
-    assert judged("0.5", old(IDLE, 0x0100_0000), **wanted)[1] != watchdog
+    found = new(IDLE, 0x0100_0000, ProcedureResult.DISARMED)
+    for dialect, heartbeat in (("0.5", old(IDLE, 0x800)), ("0.6", found)):
+        assert judged(dialect, heartbeat, wanted_armed=True)[1] & watchdog
+        assert judged(dialect, heartbeat, wanted_armed=False) == (IDLE, 0)
+    assert judged("0.5", old(IDLE, 0x800), wanted_armed=True) == (IDLE, watchdog)
+    assert judged("0.6", new(IDLE, 0x0100_0000), wanted_armed=True) == (IDLE, watchdog)
+    wrong = judged("0.6", new(IDLE, 0x800), wanted_armed=True)
+    assert wrong == (IDLE, AxisError.MOTOR_FAILED)
+    assert judged("0.5", old(IDLE, 0x0100_0000), wanted_armed=True)[1] != watchdog
 
 
-@pytest.mark.parametrize(
-    ("dialect", "heartbeat"),
-    [("0.5", old(IDLE, 0x800)), ("0.6", new(IDLE, 0x0100_0000, ProcedureResult.DISARMED))],
-)
-def test_a_watchdog_out_before_any_write_is_no_error(dialect: Dialect, heartbeat: bytes) -> None:
-    assert judged(dialect, heartbeat, wanted_armed=False) == (IDLE, 0)
-    assert judged(dialect, heartbeat, wanted_armed=True)[1] != 0
-
-
-@pytest.mark.parametrize("error", [0x800, 0x0100_0000, 0x40, 1 << 31])
-def test_while_the_dialect_is_not_known_any_error_is_one_and_has_no_name(error: int) -> None:
-    for state in (IDLE, CLOSED):
-        heartbeat = new(state, error)
-        assert dialect_of(heartbeat) == ""
-        assert judged("", heartbeat, wanted_armed=False) == (state, OTHER_ERROR)
-
-
-def test_while_the_dialect_is_not_known_the_state_is_believed() -> None:
+def test_while_the_dialect_is_not_known_the_state_is_believed_and_any_error_is_one() -> None:
+    """It has no name; a failed motor of 0.5 is one."""
+    for error in (0x800, 0x0100_0000, 0x40, 1 << 31):
+        for state in (IDLE, CLOSED):
+            heartbeat = new(state, error)
+            assert dialect_of(heartbeat) == ""
+            assert judged("", heartbeat, wanted_armed=False) == (state, OTHER_ERROR)
     busy = new(CLOSED, result=ProcedureResult.BUSY)
     report = report_of((0, busy), (1, busy))
     assert (report.dialect, report.status, report.errors) == ("", DriveStatus.ARMED, 0)
-
-
-def test_a_failed_motor_of_0_5_is_an_error_even_before_its_dialect_is_known() -> None:
     failed = old(IDLE, motor=True, done=False)
     assert report_of((0, failed), (1, old(IDLE, done=False))).status is DriveStatus.ERROR
 
@@ -178,23 +164,12 @@ def test_leaving_closed_loop_without_an_error_is_one(closed: bytes, left: bytes)
 
 # ---- what an ODrive's registers say
 
-NONE = (0,) * 8
 
-
-@pytest.mark.parametrize(
-    ("states", "error", "status"),
-    [
-        ((IDLE, IDLE), 0, DriveStatus.IDLE),
-        ((CLOSED, IDLE), 0, DriveStatus.IDLE),
-        ((IDLE, CLOSED), 0, DriveStatus.IDLE),
-        ((CLOSED, CLOSED), 0, DriveStatus.ARMED),
-        ((CLOSED, CLOSED), 1, DriveStatus.ERROR),
-    ],
-)
-def test_a_module_is_armed_when_both_axes_are_without_an_error(
-    states: tuple[int, int], error: int, status: DriveStatus
-) -> None:
-    assert AxesStatus().judge(states, error) is status
+def test_a_module_is_armed_when_both_axes_are_without_an_error() -> None:
+    for states in ((IDLE, IDLE), (CLOSED, IDLE), (IDLE, CLOSED), (CLOSED, CLOSED)):
+        armed = states == (CLOSED, CLOSED)
+        assert AxesStatus().judge(states, 0) is (DriveStatus.ARMED if armed else DriveStatus.IDLE)
+    assert AxesStatus().judge((CLOSED, CLOSED), 1) is DriveStatus.ERROR
 
 
 @pytest.mark.parametrize("first", [0, 4])
@@ -211,12 +186,9 @@ def test_a_module_is_armed_when_both_axes_are_without_an_error(
 def test_every_register_of_either_axis_shows(
     first: int, register: int, value: int, error: int
 ) -> None:
-    registers = list(NONE)
+    registers = [0] * 8
     registers[first + register] = value
     assert AxesStatus.errors(registers, wanted_armed=True) == error
-
-
-@pytest.mark.parametrize(("wanted_armed", "seen"), [(True, True), (False, False)])
-def test_a_watchdog_counts_only_where_armed_is_wanted(wanted_armed: bool, seen: bool) -> None:
-    registers = [AxisError.WATCHDOG_TIMER_EXPIRED, *NONE[1:]]
-    assert bool(AxesStatus.errors(registers, wanted_armed=wanted_armed)) == seen
+    registers = [AxisError.WATCHDOG_TIMER_EXPIRED, *[0] * 7]
+    assert AxesStatus.errors(registers, wanted_armed=True)
+    assert not AxesStatus.errors(registers, wanted_armed=False), "only where armed is wanted"

@@ -4,28 +4,21 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
 from services.joint.drivers import odrive_can
-from services.joint.drivers.base import DriveStatus
 from services.joint.drivers.can_link import RETRY_MS
 from services.joint.drivers.frame_times import REBOOT_MS
 from services.joint.drivers.odrive_can import OdriveCan
 from services.simulator.fronts.cansimple_dialects import DialectName
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisError, AxisState
 from shared.clock import NS_PER_MS
 from shared.exceptions import DriveError
-from tests.joint.drivers.rig import (
-    AXES,
-    MS,
-    NODES,
-    TARGET,
-    Rig,
-    Shed,
-    arm,
-)
+from tests.joint.drivers.rig import AXES, MS, NODES, TARGET, Rig, Shed, arm
 
 CLOSED = AxisState.CLOSED_LOOP_CONTROL
 
@@ -71,8 +64,10 @@ def test_a_drive_found_armed_tells_its_torques(rig: Rig, driver: OdriveCan, shed
 
 
 def test_another_firmware_is_found_out_after_a_long_silence(shed: Shed) -> None:
+    """A short one keeps the dialect."""
     before = shed.rig(dialect="0.5")
     driver = shed.connected(before)
+    assert (driver.read(0.0), driver.dialect) == (None, "0.5")
     before.hub.close()
     driver.read(0.0)
     time.sleep((max(REBOOT_MS, RETRY_MS) + 50) * MS)
@@ -85,44 +80,29 @@ def test_another_firmware_is_found_out_after_a_long_silence(shed: Shed) -> None:
     assert driver.dialect == "0.6"
 
 
-def test_a_short_silence_keeps_the_dialect(driver: OdriveCan, dialect: DialectName) -> None:
-    assert driver.read(0.0) is None
-    assert driver.dialect == dialect
-
-
 def test_a_position_is_set_in_the_firmware_s_own_unit(rig: Rig, driver: OdriveCan) -> None:
+    """One beyond the frame is refused, and one that is not sent names the nodes."""
     driver.set_position((64.25, -3.5))
     rig.step()
     driver.read(0.5)
-    reading = rig.cycle(driver)
-    assert reading.pos_turns == pytest.approx((64.25, -3.5), abs=1e-3)
-
-
-def test_no_position_is_set_while_the_firmware_is_not_known(shed: Shed) -> None:
-    with pytest.raises(DriveError, match="which firmware"):
-        shed.driver().set_position((0.0, 0.0))
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e9])
-def test_a_position_beyond_the_frame_is_refused(rig: Rig, driver: OdriveCan, bad: float) -> None:
-    with pytest.raises(DriveError, match="32 bits"):
-        driver.set_position((1.0, 10.0 * bad))
-
-
-def test_a_position_that_is_not_sent_names_the_nodes(rig: Rig, driver: OdriveCan) -> None:
+    assert rig.cycle(driver).pos_turns == pytest.approx((64.25, -3.5), abs=1e-3)
+    for bad in (math.nan, math.inf, 1e10):
+        with pytest.raises(DriveError, match="32 bits"):
+            driver.set_position((1.0, bad))
     rig.hub.close()
     driver.read(0.0)
     with pytest.raises(DriveError, match=f"{NODES[0]} and {NODES[1]}"):
         driver.set_position((0.0, 0.0))
 
 
-def test_counts_are_needed_by_0_5_only(rig: Rig, shed: Shed, dialect: DialectName) -> None:
+def test_a_position_needs_a_known_firmware_and_counts_for_0_5(
+    rig: Rig, shed: Shed, dialect: DialectName
+) -> None:
     driver = shed.driver(counts_per_turn=None)
+    with pytest.raises(DriveError, match="which firmware"):
+        driver.set_position((0.0, 0.0))
     rig.cycle(driver)
-    if dialect == "0.5":
-        with pytest.raises(DriveError, match="counts"):
-            driver.set_position((1.0, 1.0))
-    else:
+    with pytest.raises(DriveError, match="counts") if dialect == "0.5" else nullcontext():
         driver.set_position((1.0, 1.0))
 
 

@@ -15,19 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
-from services.simulator.fronts.cansimple_dialects import DialectName
+from services.joint.drivers.base import MotorTarget
 from services.simulator.fronts.unix_can_hub import UnixCanHub
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, ControlMode
 from shared.can.unix_can import Frame
-from tests.joint.drivers.rig import AXES, DRIVE, MS, TARGET, Shed
+from tests.joint.drivers.rig import AXES, DRIVE, TARGET, Line, Shed
 
-LOSS = 0.3
-
-
-STEP_MS = 4
-
-
+ARMED = [AxisState.CLOSED_LOOP_CONTROL] * 2
 ASK_EVERY_MS = 500
 """How often a joint service repeats a request that has shown no effect."""
 
@@ -38,7 +33,6 @@ class LossyHub(UnixCanHub):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self.dice = random.Random(0)
-        self.loss = LOSS
         self.lost = 0
 
     def poll(self) -> list[Frame]:
@@ -50,144 +44,92 @@ class LossyHub(UnixCanHub):
                 super().broadcast_packet(packet[at : at + 16])
 
     def _loses(self) -> bool:
-        loses = self.dice.random() < self.loss
+        loses = self.dice.random() < 0.3
         self.lost += loses
         return loses
 
 
-class Bench:
-    """A drive on a lossy bus, in its own time, and what a joint service does about it."""
-
-    def __init__(self, shed: Shed, seed: int, dialect: DialectName) -> None:
-        self.shed = shed
-        self.rig = shed.rig(dialect=dialect, hub=LossyHub)
-        assert isinstance(self.rig.hub, LossyHub)
-        self.hub = self.rig.hub
-        self.hub.dice.seed(seed)
-        self.driver = shed.driver()
-        self.status = DriveStatus.LOST
-
-    def cycle(self) -> DriveReading | None:
-        self.rig.step()
-        self.shed.wait((STEP_MS - 1) * MS)
-        reading = self.driver.read(0.0)
-        if reading is not None:
-            self.status = reading.status
-        return reading
-
-    def run(self, ms: int, target: MotorTarget | None = None) -> None:
-        for _ in range(ms // STEP_MS):
-            self.cycle()
-            if target is not None:
-                self.driver.write(target)
-
-    def until_armed(self, *, onboard: bool) -> int:
-        """Ask until the drive is armed; return how often it was asked."""
-        for asked in range(1, 20):
-            self.driver.arm(onboard=onboard)
-            for _ in range(ASK_EVERY_MS // STEP_MS):
-                self.cycle()
-                if not onboard:
-                    self.driver.write_torque((0.0, 0.0))
-                if self.status is DriveStatus.ARMED:
-                    return asked
-        return 0
+@pytest.fixture(params=itertools.product(range(3), ["0.5", "0.6"]))
+def line(request: pytest.FixtureRequest, shed: Shed) -> Iterator[Line]:
+    seed, dialect = request.param
+    line = Line(shed, LossyHub, dialect=dialect)
+    line.hub.dice.seed(seed)
+    yield line
+    assert line.hub.lost > 10
 
 
-@pytest.fixture(params=range(3))
-def seed(request: pytest.FixtureRequest) -> int:
-    return int(request.param)
-
-
-@pytest.fixture(params=["0.5", "0.6"])
-def bench(request: pytest.FixtureRequest, shed: Shed, seed: int) -> Iterator[Bench]:
-    bench = Bench(shed, seed, request.param)
-    bench.rig.as_shipped()
-    yield bench
-    assert bench.hub.lost > 10
+def until_armed(line: Line, *, onboard: bool) -> None:
+    """Ask until the drive is armed, as a joint service does."""
+    for _ in range(20):
+        line.driver.arm(onboard=onboard)
+        for _ in range(ASK_EVERY_MS // 2):
+            line.cycle()
+            if not onboard:
+                line.driver.write_torque((0.0, 0.0))
+            if line.status is DriveStatus.ARMED:
+                return
 
 
 @pytest.mark.parametrize("onboard", [True, False])
-def test_modes_limits_gains_and_targets_arrive(bench: Bench, onboard: bool) -> None:
-    bank, axes = bench.rig.bank, list(AXES)
+def test_modes_limits_gains_and_targets_arrive(line: Line, onboard: bool) -> None:
+    bank, axes = line.rig.bank, list(AXES)
     bank.control_mode[:] = ControlMode.POSITION
-    bench.run(100)
-    assert bench.until_armed(onboard=onboard)
-    for _ in range(1200 // STEP_MS):
-        bench.cycle()
-        bench.driver.write(TARGET) if onboard else bench.driver.write_torque((0.25, -0.5))
-    assert bench.rig.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
+    line.run(100)
+    until_armed(line, onboard=onboard)
+    for _ in range(600):
+        line.cycle()
+        line.driver.write(TARGET) if onboard else line.driver.write_torque((0.25, -0.5))
+    assert (line.rig.states, line.status) == (ARMED, DriveStatus.ARMED)
     mode = ControlMode.POSITION if onboard else ControlMode.TORQUE
     assert list(bank.control_mode[axes]) == [mode] * 2
-    np.testing.assert_allclose(bank.vel_limit[axes], DRIVE.vel_limit)
-    np.testing.assert_allclose(bank.current_lim[axes], DRIVE.current_lim)
+    arrived = [(bank.vel_limit, DRIVE.vel_limit), (bank.current_lim, DRIVE.current_lim)]
     if onboard:
-        np.testing.assert_allclose(bank.pos_gain[axes], TARGET.pos_gain, rtol=1e-6)
-        np.testing.assert_allclose(bank.vel_gain[axes], TARGET.vel_gain, rtol=1e-6)
-        assert not bank.vel_integrator_gain[axes].any()
-        np.testing.assert_allclose(bank.input_pos[axes], TARGET.pos_turns)
-        np.testing.assert_allclose(bank.input_vel[axes], TARGET.vel_turns)
-        np.testing.assert_allclose(bank.input_torque[axes], TARGET.torque)
+        arrived += [(bank.pos_gain, TARGET.pos_gain), (bank.vel_gain, TARGET.vel_gain)]
+        arrived += [(bank.input_pos, TARGET.pos_turns), (bank.input_vel, TARGET.vel_turns)]
+        arrived += [(bank.input_torque, TARGET.torque), (bank.vel_integrator_gain, (0.0, 0.0))]
     else:
-        assert list(bank.input_torque[axes]) == [0.25, -0.5]
-    assert bench.status is DriveStatus.ARMED
+        arrived += [(bank.input_torque, (0.25, -0.5))]
+    for found, wanted in arrived:
+        np.testing.assert_allclose(found[axes], wanted, rtol=1e-6)
 
 
-def test_a_drive_that_is_idled_until_it_is_idle_ends_idle(bench: Bench) -> None:
-    bench.run(100)
-    bench.until_armed(onboard=True)
-    bench.run(300, TARGET)
+def test_an_axis_that_disarms_shows_and_a_drive_that_is_idled_until_it_is_idle_ends_idle(
+    line: Line,
+) -> None:
+    line.run(100)
+    until_armed(line, onboard=True)
+    line.run(300, TARGET)
+    line.rig.bank.inject("hip_right.axis1", "DISARM")
+    line.run(100, TARGET)
+    assert line.status is DriveStatus.ERROR
+    until_armed(line, onboard=True)
+    assert line.rig.states == ARMED
     for _ in range(12):
-        bench.driver.idle()
-        bench.run(100)
-    assert bench.rig.states == [AxisState.IDLE] * 2
+        line.driver.idle()
+        line.run(100)
+    assert line.rig.states == [AxisState.IDLE] * 2
 
 
-def test_the_dialect_is_found_and_never_the_wrong_one(bench: Bench) -> None:
-    truth = "0.6" if bench.rig.front._dialect.sdo is not None else "0.5"
-    for _ in range(200):
-        bench.cycle()
-        assert bench.driver.dialect in ("", truth)
-        assert bench.status is not DriveStatus.ERROR or bench.driver.dialect == ""
-    assert bench.driver.dialect == truth
-
-
-def test_an_axis_that_disarms_shows_though_heartbeats_are_lost(bench: Bench) -> None:
-    bench.run(100)
-    bench.until_armed(onboard=True)
-    bench.rig.bank.inject("hip_right.axis1", "DISARM")
-    bench.run(100, TARGET)
-    assert bench.status is DriveStatus.ERROR
+def test_the_dialect_is_found_and_never_the_wrong_one(line: Line) -> None:
+    truth = "0.6" if line.rig.front._dialect.sdo is not None else "0.5"
+    for _ in range(400):
+        line.cycle()
+        assert line.driver.dialect in ("", truth)
+        assert line.status is not DriveStatus.ERROR or line.driver.dialect == ""
+    assert line.driver.dialect == truth
 
 
 # ---- each frame lost, one after the other
 
 HERE = (0.1, -0.2)
-
-
 HOLD = MotorTarget((0.15, -0.15), (0.0, 0.0), (0.2, -0.1), (60.0, 40.0), (0.2, 0.3))
-
-
 SPRING = np.array([60.0 * 0.2 * 0.05, 40.0 * 0.3 * 0.05])
-
-
+HELD = np.array(HOLD.torque) + SPRING
 DAMP = MotorTarget((0.15, -0.15), (0.0, 0.0), (0.8, 0.5), (0.0, 0.0), (0.4, 0.4))
 """With HOLD's spring, at this position, as torque."""
-
-
-HOLD_MS, DAMP_MS = 40, 40
-
-
-CYCLE_MS = 2
-
-
-LISTEN_MS = 20
-
-
+HOLD_MS, DAMP_MS, LISTEN_MS, CYCLE_MS = 40, 40, 20, 2
 EXCESS_MAX = 1.02 * 0.4 / 0.2
 """As a ratio of the spring's torque: without DAMP's pos_gain, HOLD's acts with DAMP's vel_gain."""
-
-
 ENTERING = 14
 """Frames of the order to arm."""
 
@@ -218,43 +160,31 @@ class Run:
 
     def __init__(self, shed: Shed, lost: Iterable[int]) -> None:
         shed.now_s = 0.0
-        self.rig = shed.rig(hub=DroppingHub)
-        hub = self.rig.hub
-        assert isinstance(hub, DroppingHub)
-        self.rig.as_shipped()
-        self.rig.pos[list(AXES)] = HERE
-        self.torques: list[np.ndarray] = []
-        self.status = DriveStatus.LOST
-        self.held_ms = 0
-        self.driver = shed.driver()
-        self._cycle(None, LISTEN_MS)
-        self.torques.clear()
-        self.rig.front.receive()  # where it is, which was asked before: no frame of an order
-        hub.lost, hub.count = frozenset(lost), 0
-        self.driver.arm(onboard=True)
+        line = self.line = Line(shed, DroppingHub)
+        line.rig.pos[list(AXES)] = HERE
+        line.run(LISTEN_MS)
+        line.torques.clear()
+        line.rig.front.receive()  # where it is, which was asked before: no frame of an order
+        line.hub.lost, line.hub.count = frozenset(lost), 0
+        line.driver.arm(onboard=True)
         for _ in range(200):
-            if self.status is DriveStatus.ARMED:
+            if line.status is DriveStatus.ARMED:
                 break
-            self._cycle(None, CYCLE_MS)
+            line.cycle()
         else:
-            self.driver.arm(onboard=True)  # as the joint service does, 500 ms later
-            self._cycle(None, LISTEN_MS)
-        self.held_ms = len(self.torques)
-        self._cycle(HOLD, HOLD_MS)
-        self._cycle(DAMP, DAMP_MS)
-        self.frames = hub.count
-        self.driver.close()
-        hub.close()
+            line.driver.arm(onboard=True)  # as the joint service does, 500 ms later
+            line.run(LISTEN_MS)
+        self.held_ms = len(line.torques)
+        line.run(HOLD_MS, HOLD)
+        line.run(DAMP_MS, DAMP)
+        self.frames, self.torques = line.hub.count, np.array(line.torques)
+        line.driver.close()
+        line.hub.close()
 
-    def _cycle(self, target: MotorTarget | None, ms: int) -> None:
-        for _ in range(ms // CYCLE_MS):
-            for _ in range(CYCLE_MS):
-                self.torques.append(self.rig.step()[list(AXES)].copy())
-            reading = self.driver.read(0.0)
-            if reading is not None:
-                self.status = reading.status
-            if target is not None:
-                self.driver.write(target)
+    @property
+    def excess(self) -> float:
+        """By how much motors pull beyond HOLD's torque, the largest that is ever asked for."""
+        return float((np.maximum(0.0, np.abs(self.torques) - np.abs(HELD)) / SPRING).max())
 
 
 Runner = Callable[[Iterable[int]], Run]
@@ -266,39 +196,27 @@ def run(shed: Shed) -> Runner:
     return lambda lost: Run(shed, lost)
 
 
-def excess(torques: list[np.ndarray]) -> np.ndarray:
-    """Return by how much motors pull beyond HOLD's torque, the largest that is ever asked for."""
-    wanted = np.array(HOLD.torque) + SPRING
-    return np.maximum(0.0, np.abs(np.array(torques)) - np.abs(wanted)) / SPRING
-
-
-def test_without_loss_the_drive_does_what_is_commanded(run: Runner) -> None:
-    whole = run(())
-    assert excess(whole.torques).max() < 1e-3
-    wanted = np.array(HOLD.torque) + SPRING
-    np.testing.assert_allclose(whole.torques[-1], wanted, atol=2e-3)
-    np.testing.assert_allclose(whole.torques[-DAMP_MS - 10], wanted, atol=2e-3)
-    assert not np.array(whole.torques[: whole.held_ms]).any()
-
-
 def test_no_single_lost_frame_is_felt_for_longer_than_three_cycles(run: Runner) -> None:
     whole = run(())
+    assert whole.excess < 1e-3, "without loss the drive does what is commanded"
+    for ms in (-1, -DAMP_MS - 10):
+        np.testing.assert_allclose(whole.torques[ms], HELD, atol=2e-3)
+    assert not whole.torques[: whole.held_ms].any()
     for lost in range(ENTERING, whole.frames):
-        torques = run((lost,)).torques
-        differs = np.abs(np.array(torques) - np.array(whole.torques)).max(axis=1) > 2e-3
+        each = run((lost,))
+        differs = np.abs(each.torques - whole.torques).max(axis=1) > 2e-3
         assert np.count_nonzero(differs) <= 3 * CYCLE_MS, f"frame {lost}"
-        assert excess(torques).max() < EXCESS_MAX, f"frame {lost}"
+        assert each.excess < EXCESS_MAX, f"frame {lost}"
         assert not differs[-1], f"frame {lost}"
 
 
 def test_no_lost_frame_of_arming_gives_a_torque_before_a_target(run: Runner) -> None:
     for lost in range(ENTERING):
         each = run((lost,))
-        before = np.array(each.torques[: each.held_ms])
-        assert np.abs(before).max() < 1e-3, f"frame {lost}"
-        assert each.status is DriveStatus.ARMED, f"frame {lost}"
-        assert each.rig.states == [AxisState.CLOSED_LOOP_CONTROL] * 2
-        np.testing.assert_allclose(each.torques[-1], np.array(HOLD.torque) + SPRING, atol=2e-3)
+        assert np.abs(each.torques[: each.held_ms]).max() < 1e-3, f"frame {lost}"
+        assert each.line.status is DriveStatus.ARMED, f"frame {lost}"
+        assert each.line.rig.states == ARMED
+        np.testing.assert_allclose(each.torques[-1], HELD, atol=2e-3)
 
 
 def test_no_pair_of_lost_frames_adds_more_or_lasts(run: Runner) -> None:
@@ -307,7 +225,5 @@ def test_no_pair_of_lost_frames_adds_more_or_lasts(run: Runner) -> None:
     pairs += list(itertools.combinations(range(frames - 55, frames - 25), 2))
     for lost in random.Random(0).sample(pairs, 40):
         each = run(lost)
-        assert excess(each.torques).max() < EXCESS_MAX, f"frames {lost}"
-        np.testing.assert_allclose(
-            each.torques[-1], np.array(HOLD.torque) + SPRING, atol=2e-3, err_msg=f"frames {lost}"
-        )
+        assert each.excess < EXCESS_MAX, f"frames {lost}"
+        np.testing.assert_allclose(each.torques[-1], HELD, atol=2e-3, err_msg=f"frames {lost}")

@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 
-from services.joint.drivers.base import DriveReading, DriveStatus, MotorTarget
+from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.drivers.frame_times import ARM_GRACE_MS
+from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from tests.joint.drivers.rig import DRIVE, MS, Rig, Shed, read
 
 MODULES = 3
-
 
 NODES = [(0, 1), (2, 3), (4, 5)]
 
@@ -57,11 +57,16 @@ def test_each_driver_reads_its_own_two_axes(leg: Leg) -> None:
     assert [reading.status for reading in leg.cycles()] == [DriveStatus.IDLE] * MODULES
 
 
-def test_arming_one_module_leaves_its_neighbours_alone(leg: Leg) -> None:
+def test_arming_and_a_fault_of_one_module_leave_its_neighbours_alone(leg: Leg) -> None:
     leg.cycles()
-    assert leg.arm(1) == [DriveStatus.IDLE, DriveStatus.ARMED, DriveStatus.IDLE]
+    idle, armed = DriveStatus.IDLE, DriveStatus.ARMED
+    assert leg.arm(1) == [idle, armed, idle]
     closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in leg.bank.state[:6]]
     assert closed == [False, False, True, True, False, False]
+    assert leg.arm(0, 2) == [armed] * 3
+    leg.bank.inject("knee_right.axis0", "OVERSPEED")
+    statuses = [reading.status for reading in leg.cycles()]
+    assert statuses == [armed, DriveStatus.ERROR, armed]
 
 
 def test_each_module_does_what_its_own_driver_writes(leg: Leg) -> None:
@@ -73,14 +78,6 @@ def test_each_module_does_what_its_own_driver_writes(leg: Leg) -> None:
     leg.step()
     assert list(leg.bank.input_pos[:6]) == [0.0, 0.0, 1.0, -1.0, 2.0, -2.0]
     np.testing.assert_allclose(leg.bank.pos_gain[:6], [1.0, 1.0, 2.0, 2.0, 3.0, 3.0])
-
-
-def test_a_fault_of_one_module_is_no_fault_of_another(leg: Leg) -> None:
-    leg.cycles()
-    leg.arm(0, 1, 2)
-    leg.bank.inject("knee_right.axis0", "OVERSPEED")
-    statuses = [reading.status for reading in leg.cycles()]
-    assert statuses == [DriveStatus.ARMED, DriveStatus.ERROR, DriveStatus.ARMED]
 
 
 def test_a_silent_module_is_lost_though_its_neighbours_go_on(leg: Leg) -> None:

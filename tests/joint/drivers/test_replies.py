@@ -22,7 +22,6 @@ from tests.joint.drivers.rig import DRIVE, NODES, Rig, Shed, arm
 
 ZERO = (0.0, 0.0)
 
-
 COUNTED = (0.5, -64.25)
 
 
@@ -46,29 +45,22 @@ def receive_counts(bench: Bench) -> None:
         bench.send(node, Command.GET_ENCODER_COUNT, data)
 
 
-def test_a_drive_with_other_estimates_is_asked_for_no_count(bench: Bench) -> None:
+def test_a_count_is_forgotten_with_a_restart_the_link_and_in_a_long_silence(bench: Bench) -> None:
+    """A drive with other estimates than zeros is asked for none."""
+    forgets = {
+        "a restart": lambda: receive_estimates(bench, (0.6, -64.0)),
+        "the link": lambda: renew_the_link(bench),
+        "a silence": lambda: bench.after(REBOOT_MS + 1),
+    }
+    for why, forget in forgets.items():
+        receive_counts(bench)
+        assert receive_estimates(bench, ZERO).pos_turns == COUNTED
+        forget()
+        assert receive_estimates(bench, ZERO).pos_turns == ZERO, why
     receive_estimates(bench, (0.25, 0.25))
     bench.commands()
     assert receive_estimates(bench, (0.25, 0.25)).pos_turns == (0.25, 0.25)
     assert bench.commands() == []
-
-
-def test_a_count_from_before_a_restart_is_not_believed_after_it(bench: Bench) -> None:
-    receive_counts(bench)
-    assert receive_estimates(bench, ZERO).pos_turns == COUNTED
-    receive_estimates(bench, (0.6, -64.0))
-    assert receive_estimates(bench, ZERO).pos_turns == ZERO
-
-
-def test_a_count_is_forgotten_with_the_link_and_in_a_long_silence(bench: Bench) -> None:
-    receive_counts(bench)
-    assert receive_estimates(bench, ZERO).pos_turns == COUNTED
-    renew_the_link(bench)
-    assert receive_estimates(bench, ZERO).pos_turns == ZERO
-    receive_counts(bench)
-    assert receive_estimates(bench, ZERO).pos_turns == COUNTED
-    bench.after(REBOOT_MS + 1)
-    assert receive_estimates(bench, ZERO).pos_turns == ZERO
 
 
 def receive_currents(bench: Bench, *currents: float) -> Pair | None:
@@ -80,18 +72,13 @@ def receive_currents(bench: Bench, *currents: float) -> Pair | None:
 
 def test_the_current_is_asked_for_again_over_a_new_link(bench: Bench) -> None:
     bench.receive(AxisState.CLOSED_LOOP_CONTROL)
-    held = pytest.approx((2.0 * DRIVE.torque_constant,) * 2)
-    assert receive_currents(bench, 2.0, 2.0) == held
+    assert receive_currents(bench, float("nan"), 1.0) is None, "that is no reply"
+    held = pytest.approx((2.0 * DRIVE.torque_constant, DRIVE.torque_constant))
+    assert receive_currents(bench, 2.0) == held
     renew_the_link(bench)
     bench.commands()
     assert bench.receive(AxisState.CLOSED_LOOP_CONTROL).torque is None
     assert Command.GET_IQ in bench.commands()
-
-
-def test_a_current_that_is_no_number_is_no_reply(bench: Bench) -> None:
-    bench.receive(AxisState.CLOSED_LOOP_CONTROL)
-    assert receive_currents(bench, float("nan"), 1.0) is None
-    assert receive_currents(bench, 2.0) is not None
 
 
 def test_a_drive_armed_by_this_driver_reports_no_torques(rig: Rig, driver: OdriveCan) -> None:
@@ -103,7 +90,6 @@ def test_a_drive_armed_by_this_driver_reports_no_torques(rig: Rig, driver: Odriv
 # ---- which estimates of two axes make a sample
 
 PERIOD_NS = 2_000_000
-
 
 BEHIND_NS = 130_000
 """Axis1's frame comes after axis0's, back to back on a bus of 1 Mbit/s."""
@@ -163,23 +149,17 @@ def test_axes_whose_clocks_drift_past_each_other_never_stop_making_samples() -> 
     assert len(run(1000, set(), period_ns=(PERIOD_NS, slow))) >= 970
 
 
-def test_frames_that_waited_together_make_a_sample_of_the_newest() -> None:
+def test_frames_that_waited_together_make_a_sample_of_the_newest_number() -> None:
     pair = EncoderPair()
     for k in range(5):
         for axis in (0, 1):
             pair.take(axis, (float(k), 0.0), 10**9)
     assert pair.complete()
-    assert not pair.complete()
-    assert pair.estimates == [(4.0, 0.0), (4.0, 0.0)]
-
-
-@pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, math.inf)])
-def test_what_is_no_number_is_no_estimate(bad: tuple[float, float]) -> None:
-    pair = EncoderPair()
-    pair.take(0, (1.0, 2.0), 10**9)
-    pair.take(1, bad, 10**9)
-    assert not pair.complete()
-    assert pair.estimates == [(1.0, 2.0), (0.0, 0.0)]
+    for bad in ((math.nan, 0.0), (0.0, math.inf)):
+        assert not pair.complete()
+        assert pair.estimates == [(4.0, 0.0), (4.0, 0.0)]
+        for axis in (0, 1):
+            pair.take(axis, bad, 10**9)
 
 
 @pytest.mark.parametrize("dialect", ["0.5", "0.6"])

@@ -30,4 +30,4 @@ def test_machine_and_packages_are_text_and_name_what_changes_bits(
     assert '"OPENBLAS_NUM_THREADS":"1"' in machine["thread_env"]
     assert all(isinstance(value, str) and value for value in machine.values())
     assert {"architecture", "libc", "python", "cpu_model"} <= set(machine)
-    assert {"casadi", "msgspec", "numpy", "pin", "scipy"} <= set(provenance.packages())
+    assert {"casadi", "msgspec", "numpy", "pin"} <= set(provenance.packages())

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Mapping
 
 from services.joint.differential import joint_torque, motor_from_joint
-from services.joint.drivers.base import Drive, DriveReading, DriveStatus, MotorTarget
-from shared.bus.messages import Pair
+from services.joint.drivers.base import Drive, DriveReading, MotorTarget
+from shared.bus.messages import DriveStatus, Pair
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from tools.bringup.jog import JogPlan, ThereAndBack
 from tools.bringup.motion import AnyPlan, Sample
 from tools.bringup.motion_runner import Interrupts, MotionResult, run_motion
+from tools.verbs.drive.jog import JogPlan, ThereAndBack
 
 START: Pair = (0.03, -1.0)
 STEP_NS = NS_PER_S // 1000

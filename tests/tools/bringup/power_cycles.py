@@ -16,7 +16,7 @@ from shared.arrays import Array
 from shared.bus.messages import Pair
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, SIDES, kind_of, side_of
-from tools.bringup.free_leg import Upright
+from tools.bringup.hanging_leg import Upright
 from tools.bringup.whole_turns import MEASURED, ModuleEvidence
 
 EVENTS: Final = (

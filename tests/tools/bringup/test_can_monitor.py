@@ -14,16 +14,18 @@ import can
 import pytest
 
 from services.simulator.fronts.unix_can_hub import UnixCanHub
-from shared.can import cansimple, imu_can, loadcell_can
+from shared.can import cansimple
 from shared.can.cansimple import AxisState, Command, Heartbeat, arbitration_id
 from shared.can.cansimple_06 import Command06, Version, pack_version
+from shared.can.sensor_frames import pack_forces, pack_imu
 from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Frame
 from shared.clock import PACE_FILE, keep_pace
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from shared.run_directory import make_live_dir
+from tests.imu.robots import with_imu
 from tools.bringup import can_monitor
-from tools.bringup.can_monitor import bus_nodes, listen, listen_to, period_ms, round_trips
+from tools.bringup.can_monitor import bus_nodes, listen, listen_to, long_enough, period_ms
 
 NODE, STRANGER = 8, 30
 IDLE = Heartbeat(0, AxisState.IDLE, False, False, False, True)
@@ -35,7 +37,7 @@ SPOKEN: tuple[Frame, ...] = (
     (arbitration_id(NODE, Command.HEARTBEAT), BEAT),
     (arbitration_id(STRANGER, Command.HEARTBEAT), BEAT),
     (arbitration_id(NODE, Command.GET_ENCODER_ESTIMATES), cansimple.pack_two_floats(64.5, 0.0)),
-    *loadcell_can.pack([1.0, 2.0, 3.0, 4.0, 5.0, -6.0]),
+    *pack_forces([1.0, 2.0, 3.0, 4.0, 5.0, -6.0]),
 )
 """An axis, a stranger and the load cells."""
 ANSWERS: tuple[Frame, ...] = (
@@ -84,7 +86,7 @@ def test_all_that_speaks_is_taken_in_and_nothing_is_sent(short_dir: Path) -> Non
 
 
 def test_an_imu_is_received_where_there_is_one(short_dir: Path) -> None:
-    frames = tuple(imu_can.pack([1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0], valid=True))
+    frames = tuple(pack_imu([1.0, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0], valid=True))
     with bus(short_dir, frames) as (config, _):
         traffic = listen(config, (), poll_nodes=False, imu=True)
     assert traffic.imu.samples[0].rate == (0.0, 0.5, 0.0)
@@ -142,29 +144,29 @@ def test_a_missing_bus_is_reported_and_not_raised(interface: str, channel: str) 
     ],
     ids=["extended", "error", "a request, or its echo", "short", "of another", "to another"],
 )  # fmt: skip
-def test_only_the_axis_that_was_asked_answers(short_dir: Path, frame: Frame) -> None:
+def test_only_a_whole_answer_of_the_axis_that_was_asked_counts(
+    short_dir: Path, frame: Frame
+) -> None:
     with bus(short_dir, answers=(frame,)) as (config, _):
-        assert round_trips(config, (NODE,), 3)[NODE].lost == 3
-    with bus(short_dir, answers=(frame, (ASKED, ANSWER))) as (config, _):
-        assert round_trips(config, (NODE,), 3)[NODE].lost < 3, "a busy machine may be late once"
+        assert listen(config, (NODE,), poll_nodes=True).nodes[NODE].vbus_voltage is None
 
 
-class Twice:
-    """A bus on which the first request is answered twice, and no other one."""
-
-    def __init__(self) -> None:
-        self.waiting = [can.Message(arbitration_id=ASKED, data=ANSWER, is_extended_id=False)] * 2
-        self.sent = 0
-
-    def send(self, *_: object, **__: object) -> None:
-        self.sent += 1
-
-    def recv(self, _timeout: float) -> can.Message | None:
-        return self.waiting.pop() if self.sent and self.waiting else None
+def test_the_period_stands_a_reader_that_stalls_and_a_sender_that_catches_up() -> None:
+    stalled = [0.002 * i + (0.3 if i > 20 else 0.0) for i in range(40)]
+    assert period_ms(stalled, 2.0) == pytest.approx(2.0)
+    bursts = [0.002 * i if i % 2 else 0.002 * (i - 1) + 0.0001 for i in range(40)]
+    assert period_ms(bursts, 2.0) == pytest.approx(2.0, rel=0.1)
+    slow = [0.01 * i for i in range(40)]
+    assert period_ms(slow, 2.0) == pytest.approx(10.0), "another period is what it is"
+    assert period_ms(slow[:3], 2.0) is None
 
 
-def test_an_answer_that_comes_late_is_none_to_the_next_request() -> None:
-    bus = Twice()
-    took = [can_monitor._asked(bus, NODE) for _ in range(2)]  # type: ignore[arg-type]
-    assert took[0] is not None
-    assert took[1] is None
+def test_every_bus_is_listened_to_for_some_heartbeats_but_not_for_ever(robot: RobotConfig) -> None:
+    listened = [long_enough(period) for period in (20, 500, 10_000)]
+    assert listened == pytest.approx([0.5, 1.5, 3.0])
+    nodes = bus_nodes(robot)
+    assert sorted(nodes) == sorted(robot.buses)
+    assert nodes["knee_left"] == (8, 9)
+    assert nodes[robot.harness.bus] == ()
+    assert "imu" not in nodes
+    assert bus_nodes(with_imu(robot))["imu"] == ()

@@ -15,8 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from tests.tools.bringup.bench_drive import MODULE, PLAN, START, BenchDrive, jog_by
 from tools.bringup.hanging_leg import HangingJoint
-from tools.bringup.identify.sines import plan_for
-from tools.bringup.jog import JogCheck, judge, what_to_see
+from tools.bringup.identify import plan_for
 from tools.bringup.motion import (
     AnyPlan,
     Sample,
@@ -24,6 +23,7 @@ from tools.bringup.motion import (
     why_out_of_reach,
     within_stops,
 )
+from tools.verbs.drive.jog import JogCheck, judge, what_to_see
 
 LED = plan_for(1, 15.0, 0.0, HangingJoint(9.4, 88.0, (0.0, -0.3)))
 

@@ -5,23 +5,30 @@ from __future__ import annotations
 import os
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from pathlib import Path
 
+import can
 import pytest
 
-from services.joint.drivers.base import DriveReading, DriveStatus
+from services.joint.drivers.base import DriveReading
 from services.simulator.physics.plant import PlantConfig
-from shared.can.cansimple import AxisState
+from shared.bus.messages import DriveStatus
+from shared.can import cansimple
+from shared.can.cansimple import AxisState, Command
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
 from shared.joints import MODULE_INDEX
 from tests.tools.bringup.bench_drive import MODULE, PLAN, START, BenchDrive, jog_by, move
+from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted, with_driver
 from tests.tools.bringup.hung_robot import HungRobot
 from tools.bringup import motion_runner
-from tools.bringup.jog import JogPlan, ThereAndBack, judge
+from tools.bringup.boards import FoundBoards
 from tools.bringup.motion import APART_MAX, Sample, limit_drives, within_stops
 from tools.bringup.motion_runner import Interrupts, MotionResult, hanging_angles
+from tools.verbs.drive.jog import JogPlan, ThereAndBack, judge
 
 ANKLE = "ankle_left"
 HELD = JogPlan(0, ThereAndBack(0.02, 1.0, 1), 15.0)
@@ -64,13 +71,17 @@ FAULTS: dict[str, tuple[dict[str, object], JogPlan, str]] = {
     "a drive that does not arm": ({"never_arms": True}, PLAN, "does not arm: IDLE"),
     "a drive that falls silent": ({"silent_at_s": 1.2}, PLAN, "no sample of the drive"),
     "a drive that stays armed": ({"deaf": True}, PLAN, "^$"),
+    "samples that come too rarely": ({}, PLAN, "the drive's samples come too rarely"),
 }
 
 
 @pytest.mark.parametrize(("fault", "plan", "words"), FAULTS.values(), ids=FAULTS.keys())
 def test_a_fault_stops_it_within_the_torque_limit_and_the_drive_is_idled(
-    drive: BenchDrive, limited: RobotConfig, fault: dict[str, object], plan: JogPlan, words: str
-) -> None:
+    drive: BenchDrive, limited: RobotConfig, monkeypatch: pytest.MonkeyPatch,
+    fault: dict[str, object], plan: JogPlan, words: str,
+) -> None:  # fmt: skip
+    if not fault:
+        monkeypatch.setattr(motion_runner, "OVERTIME_S", -4.0)
     for name, value in fault.items():
         setattr(drive, name, value)
     result = drive.run(limited, plan)
@@ -81,15 +92,6 @@ def test_a_fault_stops_it_within_the_torque_limit_and_the_drive_is_idled(
     assert bool(result.not_idle) == bool({"silent_at_s", "deaf"} & set(fault))
     for sample in result.samples:
         assert max(abs(a - b) for a, b in zip(sample.q, START, strict=True)) < 1.5 * APART_MAX
-
-
-def test_samples_that_come_too_seldom_end_it(
-    drive: BenchDrive, limited: RobotConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(motion_runner, "OVERTIME_S", -4.0)
-    result = drive.run(limited)
-    assert "the drive's samples come too rarely" in result.trouble
-    assert drive.status is DriveStatus.IDLE
 
 
 @pytest.mark.parametrize(
@@ -109,7 +111,9 @@ def test_a_drive_that_is_somebodys_or_has_no_zero_is_not_looked_at_further(
     assert drive.largest == 0.0
 
 
-def test_an_interrupt_idles_the_drive_first(drive: BenchDrive, limited: RobotConfig) -> None:
+def test_an_interrupt_idles_the_drive_and_one_before_arms_none(
+    drive: BenchDrive, limited: RobotConfig
+) -> None:
     interrupts, drive_read = Interrupts(), drive.read
 
     def read(timeout_s: float) -> DriveReading | None:
@@ -121,15 +125,8 @@ def test_an_interrupt_idles_the_drive_first(drive: BenchDrive, limited: RobotCon
     with interrupts.kept():
         result = drive.run(limited, interrupts=interrupts)
     assert (result.trouble, result.not_idle) == ("stopped by SIGTERM", ())
-    assert interrupts.number == signal.SIGTERM
-
-
-def test_a_drive_is_not_armed_after_an_interrupt(drive: BenchDrive, limited: RobotConfig) -> None:
-    interrupts, armed = Interrupts(), []
-    interrupts.number = signal.SIGINT
-    drive.arm = lambda *, onboard: armed.append(onboard)  # type: ignore[method-assign]
-    assert drive.run(limited, interrupts=interrupts).trouble == "stopped by SIGINT"
-    assert armed == []
+    drive.arm = lambda **_: pytest.fail("armed")  # type: ignore[method-assign]
+    assert drive.run(limited, interrupts=interrupts).trouble == "stopped by SIGTERM"
 
 
 @pytest.mark.parametrize("deaf", [False, True])
@@ -198,28 +195,30 @@ def all_idle(hung: HungRobot) -> bool:
     return all(one is not None and one.status is not DriveStatus.ARMED for one in readings)
 
 
-def test_all_are_idle_again_when_a_held_module_does_not_arm(
-    hung: HungRobot, robot: RobotConfig
-) -> None:
-    hung.drives["hip_left"].never_arms = True
-    result, _ = run_ankle(hung, robot)
-    assert "hip_left: it does not arm" in result.trouble
-    assert result.not_idle == ()
-    assert all_idle(hung)
-
-
-@pytest.mark.parametrize("name", ["knee_left", "hip_left"])
-def test_a_held_module_that_disarms_stops_the_motion(
-    hung: HungRobot, robot: RobotConfig, name: str
-) -> None:
+@pytest.mark.parametrize(
+    ("spoiled", "disarms", "trouble", "not_idle"),
+    [
+        ({"hip_left": "never_arms"}, "", "hip_left: it does not arm", ()),
+        ({}, "knee_left", "knee_left: the drive is IDLE", ()),
+        ({}, "hip_left", "hip_left: the drive is IDLE", ()),
+        ({"hip_left": "never_arms", "knee_left": "deaf"}, "", "hip_left", ("knee_left",)),
+    ],
+)
+def test_a_held_module_that_fails_stops_the_motion_and_all_are_idled_or_named(
+    hung: HungRobot, robot: RobotConfig, spoiled: dict[str, str], disarms: str, trouble: str,
+    not_idle: tuple[str, ...],
+) -> None:  # fmt: skip
     def disarm() -> None:
-        for axis in (0, 1):
-            hung.bank.request_state(2 * MODULE_INDEX[name] + axis, AxisState.IDLE)
+        for axis in (0, 1) if disarms else ():
+            hung.bank.request_state(2 * MODULE_INDEX[disarms] + axis, AxisState.IDLE)
 
+    for name, fault in spoiled.items():
+        setattr(hung.drives[name], fault, True)
     result, looks = run_ankle(hung, robot, disarm)
-    assert result.trouble.startswith(f"{name}: the drive is IDLE")
+    assert result.trouble.startswith(trouble)
     assert looks < 8
-    assert all_idle(hung)
+    assert result.not_idle == not_idle
+    assert all_idle(hung) == (not_idle == ())
 
 
 def test_a_held_modules_target_goes_out_in_every_cycle(hung: HungRobot, robot: RobotConfig) -> None:
@@ -234,31 +233,78 @@ def test_a_held_modules_target_goes_out_in_every_cycle(hung: HungRobot, robot: R
     assert hung.bank.pos_gain[2 * MODULE_INDEX["knee_left"]] > 0.0
 
 
-def test_an_exception_idles_the_whole_leg(hung: HungRobot, robot: RobotConfig) -> None:
+@pytest.mark.parametrize("in_idle", [False, True], ids=["while it moves", "while one is idled"])
+def test_an_exception_leaves_no_other_drive_armed(
+    hung: HungRobot, robot: RobotConfig, in_idle: bool
+) -> None:
     def fail() -> None:
-        raise RuntimeError("a test")
+        raise OSError("a test")
 
-    with pytest.raises(RuntimeError):
+    if in_idle:
+        hung.drives["hip_left"].never_arms = True
+        hung.drives[ANKLE].idle = fail  # type: ignore[method-assign]
+    with pytest.raises(OSError, match="a test"):
         run_ankle(hung, robot, fail)
     assert all_idle(hung)
 
 
-def test_a_drive_that_raises_while_it_is_idled_leaves_no_other_armed(
-    hung: HungRobot, robot: RobotConfig
+# ---- the limits of a motion are taken back
+
+SERIAL, NOWHERE = "3A0000000005", Path("/nowhere")
+SMALL = {"axis0.controller.config.vel_limit": 3.0, "axis1.motor.config.current_lim": 3.5}
+
+
+class Link:
+    """A CAN link that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.open = True
+        self.sent: list[can.Message] = []
+
+    def connect(self) -> bool:
+        return self.open
+
+    def send(self, messages: Sequence[can.Message]) -> bool:
+        self.sent += messages
+        return True
+
+    def receive(self, _timeout_s: float) -> tuple[()]:
+        return ()
+
+    def close(self) -> None:
+        self.open = False
+
+
+def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken() -> None:
-        raise OSError("a test")
+    link = Link()
+    monkeypatch.setattr(motion_runner, "CanLink", lambda *_: link)
+    motion_runner.give_back(robot, MODULE, NOWHERE)
+    sent = [(m.arbitration_id, cansimple.unpack_two_floats(bytes(m.data))) for m in link.sent]
+    nodes = robot.module_named(MODULE).node_ids
+    ids = [cansimple.arbitration_id(node, Command.SET_LIMITS) for node in nodes]
+    assert sorted(can_id for can_id, _ in sent) == sorted(ids * motion_runner.LIMITS_TIMES)
+    wanted = (robot.drive.vel_limit, robot.drive.current_lim)
+    assert all(limits == pytest.approx(wanted) for _, limits in sent)
+    assert not link.open
+    with pytest.raises(DriveError, match="takes no frames"):
+        motion_runner.give_back(robot, MODULE, NOWHERE)
 
-    hung.drives["hip_left"].never_arms = True
-    hung.drives[ANKLE].idle = broken  # type: ignore[method-assign]
-    with pytest.raises(OSError, match="a test"):
-        run_ankle(hung, robot)
-    assert all_idle(hung)
 
-
-def test_drives_that_do_not_say_that_they_are_idle_are_named(
-    hung: HungRobot, robot: RobotConfig
+def test_over_usb_they_are_written_and_read_back(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hung.drives["knee_left"].deaf = True
-    hung.drives["hip_left"].never_arms = True
-    assert run_ankle(hung, robot)[0].not_idle == ("knee_left",)
+    board, on_usb = BoardInMemory(as_wanted() | SMALL), with_driver(robot, "odrive_usb")
+    found = FoundBoards({SERIAL: board}, {}, ())
+    monkeypatch.setattr(motion_runner, "boards_on_usb", lambda *_: nullcontext(found))
+    motion_runner.give_back(on_usb, MODULE, NOWHERE)
+    assert board.now == as_wanted()
+    assert board.saves == 0, "a board that saves restarts, and has lost its zero"
+    board.now |= SMALL
+    board.deaf.add("axis0.controller.config.vel_limit")
+    with pytest.raises(DriveError, match="did not keep"):
+        motion_runner.give_back(on_usb, MODULE, NOWHERE)
+    found.boards.clear()
+    with pytest.raises(DriveError, match=f"{SERIAL}: not there"):
+        motion_runner.give_back(on_usb, MODULE, NOWHERE)

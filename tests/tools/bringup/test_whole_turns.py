@@ -17,7 +17,7 @@ from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
 from tests.tools.bringup.power_cycles import EVENTS, power_cycle
-from tools.bringup.free_leg import BEYOND, Upright, implied_up, leg_scores
+from tools.bringup.hanging_leg import BEYOND, Upright, implied_up, leg_scores
 from tools.bringup.whole_turns import MEASURED, UNMOVED, Decision, ModuleEvidence, decide, poses_of
 
 N = 17.5

@@ -38,18 +38,16 @@ from tools.fleet.fleet_status import (
     ModuleStatus,
     RateMonitor,
     RefusedCommands,
-    ServiceStatus,
-    lead_status,
+    _tools_of,
     module_status,
-    tools_of,
 )
 from tools.fleet.status_table import (
-    describe_lead,
-    describe_real_time,
-    describe_refusals,
-    describe_sessions,
-    describe_tools,
-    describe_ways_out,
+    _describe_lead,
+    _describe_real_time,
+    _describe_refusals,
+    _describe_sessions,
+    _describe_tools,
+    _describe_ways_out,
     tables,
     warn_of_others,
 )
@@ -109,18 +107,19 @@ def test_a_module_without_states_is_not_guessed_at() -> None:
     assert (status.mode, status.tier, status.q, status.way_out) == (None, None, None, "")
 
 
-def test_a_silent_planner_is_reported() -> None:
-    assert lead_status(None) is None
-    assert "each module holds" in describe_lead(None)
-
-
-def test_the_reason_why_the_planner_does_not_lead_yet_is_reported() -> None:
-    good = LeadStatus("LEADING", wait_s=0.0, margin=1.2)
-    assert describe_lead(good) == "planner LEADING, margin 1.20"
-    waits = describe_lead(LeadStatus("ALIGNING", wait_s=12.3, margin=1.2))
-    assert "leads again in 12 s" in waits
-    line = describe_lead(LeadStatus("MISPLACED", wait_s=0.0, margin=1.2, why="a foot is ahead"))
-    assert line == "planner MISPLACED, margin 1.20; a foot is ahead"
+@pytest.mark.parametrize(
+    ("lead", "words"),
+    [
+        (None, "planner silent: each module holds by itself"),
+        (LeadStatus("LEADING", 0.0, 1.2), "planner LEADING, margin 1.20"),
+        (LeadStatus("ALIGNING", 12.3, 1.2), "leads again in 12 s"),
+        (LeadStatus("MISPLACED", 0.0, 1.2, "a foot is ahead"), "margin 1.20; a foot is ahead"),
+    ],
+)
+def test_whether_the_planner_leads_and_why_not_is_reported(
+    lead: LeadStatus | None, words: str
+) -> None:
+    assert words in _describe_lead(lead)
 
 
 def fleet_with(lead_session: int, *modules: ModuleStatus) -> FleetStatus:
@@ -134,15 +133,12 @@ def test_refused_commands_are_told_with_their_cause_sender_and_what_to_do(refusa
     rows = [
         module_status(tracking(), (RefusedCommands(refusal.name, 99, hz),)) for hz in (250.0, 120.0)
     ]
-    (line,) = describe_refusals(fleet_with(7, *rows, module_status(tracking())))
+    (line,) = _describe_refusals(fleet_with(7, *rows, module_status(tracking())))
     assert f"refused, {refusal.name} of session 99: ankle_right 250/s, knee_right 120/s; " in line
     assert len(line.rpartition("; ")[2]) > 10, "and what to do"
-
-
-def test_what_is_no_command_is_told_without_a_session() -> None:
-    malformed = RefusedCommands(Refusal.MALFORMED.name, 0, 40.0)
-    (line,) = describe_refusals(fleet_with(7, module_status(tracking(), (malformed,))))
-    assert line.startswith("refused, MALFORMED: ankle_right 40/s; ")
+    nobodys = module_status(tracking(), (RefusedCommands(refusal.name, 0, 40.0),))
+    (line,) = _describe_refusals(fleet_with(7, nobodys))
+    assert line.startswith(f"refused, {refusal.name}: ankle_right 40/s; "), "no command: no session"
 
 
 def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
@@ -150,7 +146,7 @@ def test_each_way_out_is_told_once_with_its_modules_at_any_width() -> None:
     stopped = module_status(state(Mode.DAMP, Cause.ESTOP, DriveStatus.ARMED))
     lost = module_status(state(Mode.FAULT, Cause.DRIVE_LOST, DriveStatus.LOST))
     status = fleet_with(7, stopped, lost, stopped, module_status(tracking()))
-    lines = describe_ways_out(status)
+    lines = _describe_ways_out(status)
     assert [line.partition(":")[0] for line in lines] == ["ankle_right, hip_right", "knee_right"]
     assert lines[0].endswith(": xrl rearm")
     assert "xrl kill knee_right" in lines[1]
@@ -168,17 +164,17 @@ def test_another_fleet_is_named_and_the_own_is_not(monkeypatch: pytest.MonkeyPat
 
 def test_modules_that_follow_another_planner_are_named() -> None:
     own, other = (module_status(tracking(session=session)) for session in (7, 99))
-    words = describe_sessions(fleet_with(7, own, other))
+    words = _describe_sessions(fleet_with(7, own, other))
     assert words == "knee_right: last followed session 99, and the planner heard is 7"
-    assert describe_sessions(fleet_with(7, own, module_status(None))) == ""
+    assert _describe_sessions(fleet_with(7, own, module_status(None))) == ""
 
 
 def test_the_other_tools_that_are_linked_are_told_with_their_hosts() -> None:
     others = ("lead.pad.17", f"lead.evil.{os.getpid()}", "view.lab-3.9")
     roster = ToolRoster(t_ns=1, seq=1, tools=(*others, f"status.{place_of_tool()}"))
-    status = msgspec.structs.replace(fleet_with(7), tools=tools_of(roster))
-    assert describe_tools(status) == "lead on pad, lead on evil, view on lab-3"
-    assert tools_of(None) == ()
+    status = msgspec.structs.replace(fleet_with(7), tools=_tools_of(roster))
+    assert _describe_tools(status) == "lead on pad, lead on evil, view on lab-3"
+    assert _tools_of(None) == ()
 
 
 def monitor_of(*states: JointState) -> RateMonitor:
@@ -266,25 +262,14 @@ def test_codes_that_this_version_does_not_know_are_told() -> None:
         ("hip_left", "running", False),
         ("planner", "running", False),
         ("planner", "suspended", None),
-        ("recorder", "running", False),
         ("ros2_gateway", "running", None),
     ],
 )
-def test_real_time_is_expected_of_running_services_that_the_table_gives_it(
+def test_running_services_that_the_table_gives_real_time_and_lack_it_are_told(
     monkeypatch: pytest.MonkeyPatch, name: str, state: str, real_time: bool | None
 ) -> None:
     monkeypatch.setattr(scheduling, "has_real_time", lambda _pid: False)
-    info = ServiceInfo(name, 7, state, 1.0)
-    assert fleet_status._service_status(info).real_time is real_time
-
-
-def test_services_without_real_time_are_told() -> None:
-    def row(real_time: bool | None) -> ServiceStatus:
-        return ServiceStatus(1, "running", 1.0, None, None, 0, "", real_time)
-
-    status = msgspec.structs.replace(
-        fleet_with(7), services={"planner": row(False), "hip_left": row(True), "view": row(None)}
-    )
-    assert describe_real_time(status).endswith(": planner")
-    served = msgspec.structs.replace(status, services={"hip_left": row(True)})
-    assert describe_real_time(served) == ""
+    row = fleet_status._service_status(ServiceInfo(name, 7, state, 1.0))
+    assert row.real_time is real_time
+    words = _describe_real_time(msgspec.structs.replace(fleet_with(7), services={name: row}))
+    assert words.endswith(f": {name}") if real_time is False else words == ""

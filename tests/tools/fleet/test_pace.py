@@ -16,7 +16,7 @@ from shared.joints import MODULES
 from shared.run_directory import make_live_dir
 from tests.messages import filled
 from tools.fleet import pace
-from tools.fleet.pace import CoresFullError, check_pace, usual_pace
+from tools.fleet.pace import CoresFullError, check_pace
 from tools.fleet.process_table import FleetOptions
 from tools.live import live, scenario_runner
 from tools.live.scenario_runner import ScenarioRunner
@@ -54,23 +54,18 @@ def test_a_file_without_a_pace_is_refused(tmp_path: Path, text: str) -> None:
         clock.keep_pace(tmp_path)
 
 
-def test_real_drives_know_no_slow_motion() -> None:
+@pytest.mark.parametrize(
+    ("value", "simulated", "words"),
+    [
+        (0.5, False, "only a simulated fleet"),
+        *((value, True, "to 1 is right") for value in (0.0, 0.05, 1.01, float("nan"))),
+    ],
+)
+def test_a_pace_that_cannot_be_kept_is_refused(value: float, simulated: bool, words: str) -> None:
     check_pace(0.5, simulated=True)
     check_pace(1.0, simulated=False)
-    with pytest.raises(FleetError, match="only a simulated fleet"):
-        check_pace(0.5, simulated=False)
-
-
-@pytest.mark.parametrize("value", [0.0, 0.05, 1.01, float("nan")])
-def test_a_pace_out_of_range_is_refused(value: float) -> None:
-    with pytest.raises(FleetError, match="to 1 is right"):
-        check_pace(value, simulated=True)
-
-
-def test_a_variable_that_is_no_number_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(pace.PACE_VARIABLE, "slow")
-    with pytest.raises(FleetError, match="not a number"):
-        usual_pace()
+    with pytest.raises(FleetError, match=words):
+        check_pace(value, simulated=simulated)
 
 
 class Machine:
@@ -119,13 +114,15 @@ def test_where_the_cores_are_full_the_fleet_runs_slower_and_so_do_those_after_it
     assert machine.paces[3:] == [0.36]
 
 
-def test_a_pace_that_was_asked_for_is_kept_or_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("asked", "carries"), [(1.0, 0.5), (None, 0.0)])
+def test_a_pace_that_was_asked_for_is_kept_and_no_pace_ends_the_tries(
+    asked: float | None, carries: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machine = Machine(carries=0.5)
+    monkeypatch.setenv(pace.PACE_VARIABLE, "1")
+    machine = Machine(carries)
     with pytest.raises(CoresFullError):
-        run_live(machine, monkeypatch, tmp_path, 1.0, [])
-    assert machine.paces == [1.0]
+        run_live(machine, monkeypatch, tmp_path, asked, [])
+    assert machine.paces == [1.0] if asked else min(machine.paces) >= pace.PACE_MIN
 
 
 @pytest.mark.parametrize("idle", [0.0, 0.25])
@@ -145,13 +142,3 @@ def test_the_cores_are_judged_while_the_robot_stands_before_the_scenario(
         return
     with pytest.raises(CoresFullError, match="0 % idle"):
         runner._wait_until_tracking(lambda: False)
-
-
-def test_a_machine_that_runs_no_fleet_is_reported_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(pace.PACE_VARIABLE, "1")
-    machine = Machine(carries=0.0)
-    with pytest.raises(CoresFullError):
-        run_live(machine, monkeypatch, tmp_path, None, [])
-    assert min(machine.paces) >= pace.PACE_MIN

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from tools.fleet import supervise
-from tools.fleet.supervise import START_MAX_S, ProgressWatch
+from tools.fleet.supervise import START_MAX_S, _ProgressWatch
 
 TIMEOUT_S = 30.0
 
@@ -25,7 +25,7 @@ def given_up(monkeypatch: pytest.MonkeyPatch) -> GivenUp:
     def run(used_s: Callable[[float], float], waiting: Callable[[float], int]) -> tuple[float, str]:
         now_s = 0.0
         monkeypatch.setattr(supervise, "time", SimpleNamespace(monotonic=lambda: now_s))
-        watch = ProgressWatch(TIMEOUT_S, lambda _: used_s(now_s))
+        watch = _ProgressWatch(TIMEOUT_S, lambda _: used_s(now_s))
         while not (why := watch.look(["x"] * waiting(now_s))):
             now_s += 0.1
         return now_s, why

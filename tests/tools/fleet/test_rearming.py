@@ -37,18 +37,13 @@ def test_a_stop_ends_where_all_six_bear_their_load(other: tuple[Mode, DriveStatu
 
 
 @pytest.mark.parametrize(
-    ("other", "words"),
-    [
-        ((Mode.FAULT, DriveStatus.IDLE), "knee_left is in FAULT, its drive IDLE; hang the robot"),
-        ((Mode.FAULT, DriveStatus.LOST), "knee_left is in FAULT, its drive LOST; hang the robot"),
-        ((Mode.DAMP, DriveStatus.IDLE), "knee_left is in DAMP, its drive IDLE; hang the robot"),
-        ((Mode.DISARMED, DriveStatus.UNZEROED), "knee_left is in DISARMED, its drive UNZEROED; "),
-    ],
-)
-def test_beside_a_module_without_torque_none_is_rearmed(
-    other: tuple[Mode, DriveStatus], words: str
-) -> None:
-    assert hindrance(states(knee_left=other), [], HERE, planner=True).startswith(words)
+    ("mode", "drive"),
+    [(Mode.FAULT, DriveStatus.IDLE), (Mode.FAULT, DriveStatus.LOST), (Mode.DAMP, DriveStatus.IDLE),
+     (Mode.DISARMED, DriveStatus.UNZEROED)],
+)  # fmt: skip
+def test_beside_a_module_without_torque_none_is_rearmed(mode: Mode, drive: DriveStatus) -> None:
+    why = hindrance(states(knee_left=(mode, drive)), [], HERE, planner=True)
+    assert why.startswith(f"knee_left is in {mode.name}, its drive {drive.name}; hang the robot")
 
 
 def test_none_is_rearmed_while_it_moves_or_is_pulled_or_one_is_missing() -> None:

@@ -74,15 +74,16 @@ def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says(
 
 def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     runner = object.__new__(ScenarioRunner)
-    runner._stalls, runner._killed, runner._modes = [], False, dict.fromkeys(MODULES, Mode.HOLD)
+    runner._stalls, runner._killed = StallWatch(), False
+    runner._modes = dict.fromkeys(MODULES, Mode.HOLD)
     assert runner._stall_words() == ""
     now = now_ns()
-    runner._stalls.append(Stall(now - ms(63), now))
+    runner._stalls.newest = Stall(now - ms(63), now)
     words = "the machine stalled for 63 ms"
     assert runner._stall_words() == f"{words}: all six hold"
     runner._killed = True
     assert runner._stall_words() == words, "they hold for another reason"
-    runner._stalls.append(Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S)))
+    runner._stalls.newest = Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S))
     assert runner._stall_words() == ""
 
 

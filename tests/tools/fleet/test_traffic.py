@@ -11,7 +11,7 @@ from shared.bus.codec import encode
 from shared.bus.messages import Estop
 from shared.clock import NS_PER_MS
 from shared.exceptions import RunError
-from tools.fleet.traffic import KeyTraffic
+from tools.fleet.traffic import _KeyTraffic
 from tools.topic_keys import TopicKey, every_key, keys_named
 from tools.verbs.topic.echo import as_text
 
@@ -26,7 +26,7 @@ def message(seq: int, t_ms: float) -> bytes:
     periods=st.lists(st.floats(0.1, 100.0), min_size=1, max_size=40), age_ms=st.floats(0.0, 50.0)
 )
 def test_median_and_longest_of_spacing_and_age(periods: list[float], age_ms: float) -> None:
-    traffic, now = KeyTraffic(STATE), 1e6
+    traffic, now = _KeyTraffic(STATE), 1e6
     traffic.feed(message(0, now - age_ms), round(now * NS_PER_MS))
     for seq, period in enumerate(periods, 1):
         now += period
@@ -42,7 +42,7 @@ def test_median_and_longest_of_spacing_and_age(periods: list[float], age_ms: flo
 
 def test_a_sender_on_another_host_has_no_age() -> None:
     """However near its clock is: hosts on one switch start within seconds of each other."""
-    traffic = KeyTraffic(STATE, here=False)
+    traffic = _KeyTraffic(STATE, here=False)
     for seq in range(3):
         traffic.feed(message(seq, 1e7 - 12.3 + seq), round((1e7 + seq) * NS_PER_MS))
     assert traffic.ages_ms is None
@@ -50,7 +50,7 @@ def test_a_sender_on_another_host_has_no_age() -> None:
 
 
 def test_losses_are_those_of_the_window_and_rubbish_is_counted_by_its_size() -> None:
-    traffic = KeyTraffic(STATE)
+    traffic = _KeyTraffic(STATE)
     traffic.feed(message(1, 0.0), 0)
     traffic.feed(message(4, 0.0), 0)
     assert traffic.lost == 2

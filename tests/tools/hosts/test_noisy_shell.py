@@ -10,7 +10,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tests.shared.mcap_log import runs
 from tests.tools.hosts.places import make_hosts
-from tools.hosts import hosts_file, installation, records
+from tools.hosts import hosts_file, installation, running
 from tools.hosts.remote import Remote
 
 NOISE = 'echo "Welcome to $1"; echo "17"; printf "no end of line> "'
@@ -48,9 +48,9 @@ def test_a_commands_output_is_its_own(remote: Remote) -> None:
 def test_a_record_comes_whole(base: Path, remote: Remote, tmp_path: Path) -> None:
     folder = base / "body/var/lib/xrl/out/first"
     path = runs.write(folder, [runs.item(seq) for seq in range(100)])
-    assert records.newest(remote) == "first"
-    assert records.since(remote, 0.0) == ["first"]
-    copy = records.fetch(remote, "first", tmp_path / "here") / path.name
+    assert running.newest_record(remote) == "first"
+    assert running.records_since(remote, 0.0) == ["first"]
+    copy = running.fetch_record(remote, "first", tmp_path / "here") / path.name
     assert copy.read_bytes() == path.read_bytes()
 
 

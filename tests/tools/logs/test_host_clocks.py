@@ -23,9 +23,8 @@ from tests.messages import sample
 from tests.shared.mcap_log.runs import Queue
 from tests.tools.exit_codes import exit_code
 from tools.logs.run_log import RunLog, read_run
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import NOTHING_HAPPENS
-from tools.sim.virtual_time import HostClock
+from tools.sim.lockstep import NOTHING_HAPPENS, Lockstep
+from tools.sim.virtual_services import HostClock
 from tools.topic_keys import sender_of
 
 BODY, RIGHT, LEFT = "10.0.0.1", "10.0.0.2", "10.0.0.3"

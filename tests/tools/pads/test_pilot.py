@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.physics.led_hand import HEIGHTS, PITCHES
+from services.simulator.physics.operator import HEIGHTS, PITCHES
 from tools.pads.pilot import ASSIST_RATE, DEAD_ZONE, HEIGHT_RATE, PITCH_RATE, Deflection, Pilot
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)

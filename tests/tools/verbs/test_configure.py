@@ -23,8 +23,16 @@ from shared.run_directory import make_live_dir
 from tests.system.fleets import xrl
 from tests.tools.bringup.board_in_memory import BoardInMemory, as_wanted
 from tests.tools.exit_codes import exit_code
-from tools.bringup import backup, changes, drive_access
-from tools.bringup.boards import FoundBoards, Value
+from tools.bringup import drive_access
+from tools.bringup.boards import (
+    Backup,
+    BoardBackup,
+    FoundBoards,
+    Value,
+    changes_to_wanted,
+    read_backup,
+    settings_of,
+)
 from tools.bringup.motion_runner import Interrupts
 from tools.fleet import procfs
 from tools.fleet.run_dir import RunDir
@@ -126,9 +134,9 @@ def flags(tmp_path: Path) -> configure.ConfigureFlags:
     return configure.ConfigureFlags(restore=tmp_path / "b.json")
 
 
-def saved_as(serial: str, firmware: str = "0.5.6", **settings: Value) -> backup.Backup:
-    board = backup.BoardBackup(MODULE, serial, firmware, settings)
-    return backup.Backup(time="", robot_file="", boards=(board,))
+def saved_as(serial: str, firmware: str = "0.5.6", **settings: Value) -> Backup:
+    board = BoardBackup(MODULE, serial, firmware, settings)
+    return Backup(time="", robot_file="", boards=(board,))
 
 
 def test_a_backup_is_for_the_modules_that_it_has(
@@ -187,7 +195,7 @@ def test_ctrl_c_finishes_the_board_that_was_begun_and_touches_no_other(robot: Ro
     difference = [
         change
         for module, board in boards.items()
-        for change in changes.changes_to_wanted(module, of_module(robot, MODULE), board)
+        for change in changes_to_wanted(module, of_module(robot, MODULE), board)
     ]
     interrupts = Interrupts()
     with interrupts.kept():
@@ -223,6 +231,6 @@ def test_the_backup_is_written_before_anything_else_and_under_its_time(
     board = BoardInMemory(as_wanted() | {VEL_LIMIT: 2.0})
     path = configure.keep(tmp_path / "new", {MODULE: board}, Path("robot.toml"))
     assert board.writes == []
-    (kept,) = backup.read(path).boards
-    assert backup.settings_of(kept) == as_wanted() | {VEL_LIMIT: 2.0}
+    (kept,) = read_backup(path).boards
+    assert settings_of(kept) == as_wanted() | {VEL_LIMIT: 2.0}
     assert (kept.module, kept.firmware) == (MODULE, "0.5.6")

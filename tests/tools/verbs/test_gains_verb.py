@@ -52,7 +52,7 @@ def test_a_schedule_for_no_payload_is_written_beside_the_robot_file(
     gain_schedule.require(robot, path)
 
 
-def test_the_printed_margins_are_above_what_the_planner_asks_for(
+def test_margins_above_what_the_planner_asks_for_and_the_hardest_pushes_are_printed(
     unladen: tuple[Path, str],
 ) -> None:
     path, said = unladen
@@ -64,15 +64,10 @@ def test_the_printed_margins_are_above_what_the_planner_asks_for(
     assert found, said
     assert float(found[1]) > certificate.margin_min
     assert float(found[2]) > certificate.onboard_margin_min
-
-
-def test_the_hardest_push_of_each_tier_is_printed(unladen: tuple[Path, str]) -> None:
-    _, said = unladen
     assert re.search(r"slope without an IMU.*\d\.\d degrees forwards", said)
     rows = re.findall(r"^ *\d\.\d{3} +(.*)", said.split("Hardest constant push")[1], re.M)
     assert rows
-    for row in rows:
-        assert re.search(r"\d+ / \d+", row), row
+    assert all(re.search(r"\d+ / \d+", row) for row in rows), rows
 
 
 def test_a_lighter_robot_is_held_more_softly(unladen: tuple[Path, str]) -> None:
@@ -84,10 +79,13 @@ def test_a_lighter_robot_is_held_more_softly(unladen: tuple[Path, str]) -> None:
 
 
 def test_check_reports_a_fit_until_the_robot_changes(
-    unladen: tuple[Path, str], capsys: pytest.CaptureFixture[str]
+    unladen: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, _ = unladen
     schedule = path.with_name("lab.gains.json")
+    assert exit_code(["gains", "--check", "--config", robot_file(tmp_path)]) == 3
+    assert "there is no gain schedule" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [tmp_path / "lab.toml"], "and writes none"
     before = schedule.read_bytes()
     assert exit_code(["gains", "--check", "--config", path]) == 0
     assert capsys.readouterr() == (f"{schedule}: fits the robot\n", "")
@@ -101,17 +99,6 @@ def test_check_reports_a_fit_until_the_robot_changes(
     assert said.err == ""
     assert "was made for mass.payload = 0.0, not 3.0" in said.out
     assert schedule.read_bytes() == before
-
-
-def test_check_without_a_schedule_is_exit_code_3_and_writes_none(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = robot_file(tmp_path)
-    assert exit_code(["gains", "--check", "--config", path]) == 3
-    said = capsys.readouterr()
-    assert said.err == ""
-    assert "there is no gain schedule" in said.out
-    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("beside", [None, "{}"], ids=["no schedule", "a corrupt one"])

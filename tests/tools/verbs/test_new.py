@@ -33,20 +33,14 @@ def test_a_new_directory_holds_the_shipped_robot_and_all_of_it_loads(tmp_path: P
     assert found == set(new.contents())
 
 
-def test_an_empty_directory_is_filled(
+def test_an_empty_directory_is_filled_and_a_name_with_a_space_is_quoted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert exit_code(["new", "."]) == 0
     assert (tmp_path / "robot.toml").is_file()
-    assert "what next:" in capsys.readouterr().out
-
-
-def test_a_name_with_a_space_is_quoted_in_what_is_to_be_typed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     assert exit_code(["new", tmp_path / "my lab"]) == 0
-    assert f"cd '{tmp_path}/my lab'" in capsys.readouterr().out
+    assert f"what next:\n  cd '{tmp_path}/my lab'" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -47,16 +47,11 @@ def test_nothing_starts_while_the_clock_is_before_the_certificates_time(
     assert not run_dir.exists()
 
 
-def test_where_nobody_looks_on_the_services_start_and_wait_for_the_clock(
-    not_valid_yet: RobotConfig, capsys: pytest.CaptureFixture[str]
+def test_where_nobody_looks_on_the_services_start_without_keys_and_without_a_record(
+    not_valid_yet: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     up._check_keys(not_valid_yet, must=False)
     assert "no link over TLS: " in capsys.readouterr().err
-
-
-def test_where_nobody_looks_on_a_robot_starts_without_its_record(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
     taken = tmp_path / "out"
     taken.write_text("a file", encoding="utf-8")
     up._make_record_folder(taken / "now", must=False)

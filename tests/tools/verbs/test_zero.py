@@ -12,19 +12,19 @@ import msgspec
 import pytest
 
 from services.joint.differential import joint_from_motor, motor_from_joint
-from services.joint.drivers.base import DriveReading, DriveStatus
-from shared.bus.messages import Pair
+from services.joint.drivers.base import DriveReading
+from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import FleetError, XrlError
+from shared.exceptions import FleetError
 from tests.tools.bringup.board_in_memory import with_driver
 from tools.bringup import drive_access, zeroing
 from tools.bringup.motion_runner import await_reading
-from tools.bringup.stand_angles import stand_angles
 from tools.bringup.zeroing import Back, DriveLook, is_right, look, refusal, why_outside, zero
 from tools.fleet.supervise import SupervisedFleet
 from tools.verbs.drive import zero as verb
+from tools.verbs.drive.zero import stand_angles
 
 MODULE = "knee_left"
 MARK = 64.0
@@ -234,30 +234,3 @@ def test_without_a_terminal_yes_must_be_given(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(FleetError, match="--yes"):
         drive_access.confirm("sure?", yes=False)
     assert drive_access.confirm("sure?", yes=True)
-
-
-def test_a_correction_goes_on_from_the_zero_that_is_there(robot: RobotConfig) -> None:
-    wanted = verb.corrected({"knee_left": STILL}, (0.01, -0.02), robot)
-    assert wanted == {"knee_left": pytest.approx((0.01, -1.02))}
-
-
-@pytest.mark.parametrize(
-    ("seen", "by", "words"),
-    [
-        (STILL._replace(zeroed=False), (0.0, 0.01), "no zero to correct.*--at"),
-        (STILL, (0.0, 0.11), "at most 0.1"),
-        (STILL, (math.nan, 0.0), "at most 0.1"),
-        (STILL._replace(q=(0.0, -0.05)), (0.0, 0.05), "outside"),
-    ],
-)
-def test_what_is_no_correction_is_refused(
-    robot: RobotConfig, seen: DriveLook, by: Pair, words: str
-) -> None:
-    with pytest.raises(XrlError, match=words):
-        verb.corrected({"knee_left": seen}, by, robot)
-
-
-def test_a_knee_that_hangs_on_its_stop_can_be_corrected(robot: RobotConfig) -> None:
-    at_stop = STILL._replace(q=(0.0, -0.05))
-    wanted = verb.corrected({"knee_left": at_stop}, (0.0, 0.009), robot)
-    assert wanted["knee_left"][1] == pytest.approx(-0.041)

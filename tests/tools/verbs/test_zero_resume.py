@@ -14,15 +14,16 @@ import numpy as np
 import pytest
 
 from services.joint.differential import joint_from_motor
-from services.joint.drivers.base import Drive, DriveStatus
+from services.joint.drivers.base import Drive
 from services.joint.drivers.wired_drive import MotorFrame
 from services.simulator.physics.plant import PlantConfig, changed
+from shared.bus.messages import DriveStatus
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tests.tools.bringup.hung_robot import HungDrive, HungRobot
-from tools.bringup import drive_access, motion_runner, resuming, swing, zero_record, zeroing
+from tools.bringup import drive_access, motion_runner, zero_record, zeroing
 from tools.bringup.boards import Value
 from tools.bringup.zero_record import Identity, ModuleZero, ZeroRecord, why_stranger
 from tools.verbs.drive import zero as verb
@@ -62,7 +63,7 @@ class Bench:
     def zero(self) -> None:
         """Keep the true zero, as a perfect protractor would, and where the joints rest."""
         self.hung.wait(2.0)
-        record = zero_record.read(self.path, self.robot)
+        record = zero_record.read_zeros(self.path, self.robot)
         modules: dict[str, ModuleZero] = {}
         with self.drives_of(self.robot, MODULES, self.run_dir) as drives:
             for name, drive in drives.items():
@@ -72,7 +73,7 @@ class Bench:
                 modules[name] = zero_record.zeroed(
                     self.robot, name, seen.q_there, seen.angles, identity
                 )
-        zero_record.write(self.path, msgspec.structs.replace(record, modules=modules))
+        zero_record.write_zeros(self.path, msgspec.structs.replace(record, modules=modules))
 
     @property
     def path(self) -> Path:
@@ -117,16 +118,16 @@ def bench(robot: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     virtual = SimpleNamespace(
         monotonic=lambda: made.hung.now_ns * 1e-9, strftime=lambda _: "now", sleep=made.hung.wait
     )
-    for module in (swing, zeroing, resuming, zero_record):
+    for module in (zeroing, zero_record):
         monkeypatch.setattr(module, "time", virtual)
     clock = {"clock": virtual.monotonic}
-    monkeypatch.setattr(swing, "watch", functools.partial(swing.watch, **clock))
+    monkeypatch.setattr(verb, "watch", functools.partial(zeroing.watch, **clock))
     monkeypatch.setattr(zeroing, "await_reading", functools.partial(
         motion_runner.await_reading, clock=made.hung.clock
     ))  # fmt: skip
     monkeypatch.setattr(zeroing, "now_ns", made.hung.clock)
-    monkeypatch.setattr(resuming, "drives_of", made.drives_of)
-    monkeypatch.setattr(resuming, "identities", lambda *_: made.identities)
+    monkeypatch.setattr(zero_record, "drives_of", made.drives_of)
+    monkeypatch.setattr(zero_record, "identities", lambda *_: made.identities)
     monkeypatch.setattr(drive_access, "drives_to_ourselves", ours)
     monkeypatch.setattr(drive_access, "service_on", lambda *_: None)
     return made
@@ -150,21 +151,21 @@ def test_legs_that_were_cut_off_at_work_are_resumed_once_they_have_swung(
     bench: Bench, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.zero()
-    record = zero_record.read(bench.path, bench.robot)
+    record = zero_record.read_zeros(bench.path, bench.robot)
     legs = dict.fromkeys(module for module in MODULES if not module.startswith("ankle"))
-    zero_record.write(bench.path, zero_record.with_rests(record, legs))  # cut off at work
+    zero_record.write_zeros(bench.path, zero_record.with_rests(record, legs))  # cut off at work
     bench.cut_power()
     assert bench.run(resume=True, untouched=True, level=True) == FAULT_EXIT_CODE
     assert max(bench.errors()[1:3]) == 9.0
     said = capsys.readouterr().out
     assert re.search(r"hip_left: refused: no rest of it is stored.*--swing", said, re.DOTALL)
-    watch = swing.watch
+    watch = zeroing.watch
 
     def pushed(*args: object) -> object:
         bench.push()
         return watch(*args)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(swing, "watch", pushed)
+    monkeypatch.setattr(verb, "watch", pushed)
     bench.run(resume=True, untouched=True, level=True, swing=True)
     errors = dict(zip(MODULES, bench.errors(), strict=True))
     assert max(errors[module] for module in legs) < EXACT
@@ -181,14 +182,15 @@ def test_without_a_stored_zero_the_protractor_is_named(bench: Bench) -> None:
         bench.run(resume=True)
 
 
-def test_a_zero_is_kept_with_the_angles_and_a_correction_too(bench: Bench) -> None:
+def test_a_zero_is_kept_with_the_angles(bench: Bench) -> None:
     with bench.drives_of(bench.robot, ["knee_left"], bench.run_dir) as drives:
         q = zeroing.look(drives["knee_left"], bench.robot).q
-    assert bench.run(module="knee_left", all=False, by=(0.01, -0.02)) == 0
-    before = zero_record.read(bench.path, bench.robot).modules["knee_left"]
+    at = (q[0] + 0.01, min(q[1] - 0.02, -0.2))
+    assert bench.run(module="knee_left", all=False, at=at) == 0
+    before = zero_record.read_zeros(bench.path, bench.robot).modules["knee_left"]
     rest = before.rest
     assert rest is not None
-    assert joint_from_motor(rest, 17.5) == pytest.approx((q[0] + 0.01, q[1] - 0.02), abs=1e-4)
+    assert joint_from_motor(rest, 17.5) == pytest.approx(at, abs=1e-4)
     bench.cut_power()
     assert bench.run(module="knee_left", all=False, resume=True) == FAULT_EXIT_CODE
     assert bench.errors()[4] == 9.0, "its hip and ankle have no stored zero"
@@ -215,21 +217,20 @@ def test_down_stores_where_real_drives_rest(
     lab = tmp_path / "lab.toml"
     lab.write_bytes(DEFAULT_CONFIG.read_bytes())
     services = ["planner", *MODULES]
-    assert resuming.rests_after_down(lab, tmp_path, services) == "", "emulated drives are gone"
-    for module in (resuming, zero_record):
-        monkeypatch.setattr(module, "is_simulated", lambda _: False)
-    assert resuming.rests_after_down(lab, tmp_path, services) == "", "no zero was stored"
+    assert zero_record.rests_after_down(lab, tmp_path, services) == "", "emulated drives are gone"
+    monkeypatch.setattr(zero_record, "is_simulated", lambda _: False)
+    assert zero_record.rests_after_down(lab, tmp_path, services) == "", "no zero was stored"
     bench.zero()
     kept = bench.path.rename(tmp_path / "lab.zeros.json")
-    before = zero_record.read(kept, bench.robot)
+    before = zero_record.read_zeros(kept, bench.robot)
     nowhere = zero_record.with_rests(before, dict.fromkeys(MODULES))
-    zero_record.write(kept, nowhere)
-    assert "6 of 6 modules rest" in resuming.rests_after_down(lab, tmp_path, services)
-    after = zero_record.read(kept, bench.robot)
+    zero_record.write_zeros(kept, nowhere)
+    assert "6 of 6 modules rest" in zero_record.rests_after_down(lab, tmp_path, services)
+    after = zero_record.read_zeros(kept, bench.robot)
     for module, zero in before.modules.items():
         assert after.modules[module].rest == pytest.approx(zero.rest, abs=1e-3)
     kept.write_text("{")
-    assert "is not kept: " in resuming.rests_after_down(lab, tmp_path, services)
+    assert "is not kept: " in zero_record.rests_after_down(lab, tmp_path, services)
 
 
 # ---- whose zero it is
@@ -280,12 +281,12 @@ def test_a_file_that_is_damaged_or_another_robot_s_is_refused(
     path = tmp_path / "zeros.json"
     path.write_text(text)
     with pytest.raises(DriveError, match=words):
-        zero_record.read(path, robot)
+        zero_record.read_zeros(path, robot)
 
 
 def test_a_file_is_read_back_as_it_was_written(robot: RobotConfig, tmp_path: Path) -> None:
     zero = zero_record.zeroed(robot, "knee_left", (0.0, -1.0), (0.2, 0.7), Identity("3A", KEPT))
     record = ZeroRecord(gear_ratio=17.5, encoder_counts_per_turn=16384, modules={"knee_left": zero})
     path = tmp_path / "zeros.json"
-    zero_record.write(path, record)
-    assert zero_record.read(path, robot) == record
+    zero_record.write_zeros(path, record)
+    assert zero_record.read_zeros(path, robot) == record

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from services.simulator.physics.led_hand import HEIGHTS, PUSH_MAX
+from services.simulator.physics.operator import HEIGHTS, PUSH_MAX
 from shared.bus.messages import Mode
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG

@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Iterable, Iterator
 
-from tools.field_docs import field_docs
+from tools.flags import field_docs
 
 
 def table(headings: str, rows: Iterable[Iterable[object]]) -> Iterator[str]:

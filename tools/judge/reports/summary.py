@@ -15,7 +15,7 @@ from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from shared.mcap_log.recover import describe_lost
 from shared.mcap_log.sequence_stats import KeyCount
-from shared.text_file import decoded
+from shared.toml_file import decoded
 from tools.judge import verdict, verdict_table
 from tools.judge.reports.run_data import RunData
 from tools.judge.verdict import Summary

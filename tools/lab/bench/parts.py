@@ -30,9 +30,8 @@ from shared.config.sections import CanConfig
 from shared.joints import MODULES
 from shared.mcap_log.writer import RunWriter
 from tools.lab.bench.timing import Repeated
-from tools.sim.lockstep import Lockstep, forget
+from tools.sim.lockstep import Lockstep, begin_standing, forget
 from tools.sim.recorded_lockstep import DRAIN_EVERY, RecordedMessages
-from tools.sim.standing_start import begin_standing
 
 SECONDS: Final = 3.0
 """Recorded of the squat: on the way down and up."""
@@ -140,7 +139,7 @@ def joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
         command = decoder.decode(payload) if payload else None
         manager.step(now_ns, reading, command, estop, *near)
         if next(count) % 2 == 0:
-            encode(manager.controller.state(now_ns))
+            encode(manager.controller.state(manager.state.controller, now_ns))
 
     return Repeated(once)
 

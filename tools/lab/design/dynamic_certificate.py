@@ -24,9 +24,8 @@ import numpy as np
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
-from services.planner.law.gains import GainLaw
 from services.planner.law.model import BodyInertia
-from services.planner.law.split import CouplingGains
+from services.planner.law.split import CouplingGains, GainLaw
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import GainLaw
 from shared.arrays import Array
 from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import GRAVITY, RobotConfig

@@ -25,18 +25,19 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy.optimize
-from scipy.spatial.transform import Rotation
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
-from services.planner.law.gains import GainLaw
 from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import GainLaw
 from shared.arrays import Array
 from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.extras import late
 from shared.joints import MODULES, N_JOINTS, N_LEG, SIDES
 from shared.robot.robot_model import ankle_positions
 from tools.lab.design.poses import Poses
+
+optimize, transform = late("scipy.optimize"), late("scipy.spatial.transform")
 
 FRICTION: Final = 0.5
 """Friction coefficient of the soles on a slippery floor."""
@@ -113,7 +114,7 @@ class LoadedStand:
         """Torso twist per joint rate of each leg (6, 6), linear before angular."""
         D_left = kinematics.D_left
         weight = config.torso_mass * GRAVITY
-        rotation_world_torso = Rotation.from_euler("ZXY", kinematics.p[[5, 3, 4]])
+        rotation_world_torso = transform.Rotation.from_euler("ZXY", kinematics.p[[5, 3, 4]])
         arm_x, arm_y, _ = rotation_world_torso.apply(config.torso_com)
         torso = np.array([0.0, 0.0, weight, weight * arm_y, -weight * arm_x, 0.0])
         self._W = [shares @ torso for shares in (np.eye(6) - D_left, D_left)]
@@ -247,7 +248,7 @@ class LoadedStand:
         rows = np.array([limit.row for limit in self._limits])
         limp_rows = np.array([limit.part == f"torque of {limp}" for limit in self._limits])
         bounds = np.where(limp_rows, 0.0, [limit.bound for limit in self._limits]) - rows @ unpushed
-        solution = scipy.optimize.linprog(
+        solution = optimize.linprog(
             -np.eye(7)[6],
             A_ub=rows @ slopes,
             b_ub=bounds,

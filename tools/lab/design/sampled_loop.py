@@ -28,13 +28,15 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import pole_gain
 from shared.arrays import Array
+from shared.extras import late
 from shared.joints import N_JOINTS, N_LEG
+
+linalg = late("scipy.linalg")
 
 
 class DrivetrainModel(NamedTuple):
@@ -262,7 +264,7 @@ class SampledLoop:
         n_x = len(self.A)
         block = np.zeros((n_x + B.shape[1],) * 2)
         block[:n_x, :n_x], block[:n_x, n_x:] = self.A, B
-        exact = scipy.linalg.expm(block * timing.drive_step)[:n_x]
+        exact = linalg.expm(block * timing.drive_step)[:n_x]
         self._drive_step = _Step(exact[:, :n_x], exact[:, n_x : n_x + n], exact[:, n_x + n :])
 
     def _plant(
@@ -398,7 +400,7 @@ def _laws(
     C_q, C_v = V.T @ feedback.C_q @ V, V.T @ feedback.C_v @ V
     ease_p = -alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1])
     ease_v = -alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1])
-    coupled = scipy.linalg.orth(np.hstack((C_q, C_v, integral.T, ease_p, ease_v)), rcond=ROUNDING)
+    coupled = linalg.orth(np.hstack((C_q, C_v, integral.T, ease_p, ease_v)), rcond=ROUNDING)
     return _Laws(
         D=D,
         D_B=D_B,

@@ -11,12 +11,11 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from services.planner.law.certificate import Weakest, motor_mean
-from services.planner.law.gains import GainLaw
+from services.planner.law.coupling import LawAtReference
+from services.planner.law.feet import up_of
 from services.planner.law.kinematics import Kinematics, Measured
-from services.planner.law.law_terms import LawAtReference
-from services.planner.law.levelling import up_of
 from services.planner.law.reference import Reference
-from services.planner.law.split import GainSplit, LocalGains
+from services.planner.law.split import GainLaw, GainSplit, LocalGains
 from shared.arrays import Array
 from shared.bus.messages import AS_CONFIGURED, Pair, Vector6
 from shared.config.robot_config import GRAVITY, RobotConfig

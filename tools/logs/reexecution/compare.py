@@ -8,12 +8,15 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, TypeVar
 
 import msgspec
 
 from shared.bus.messages import Message
+from shared.exceptions import RunError
 from shared.revision import UNKNOWN
+
+State = TypeVar("State")
 
 _F64: Final = struct.Struct("<d")
 _I64: Final = struct.Struct("<q")
@@ -146,6 +149,17 @@ class ReexecutionResult:
         return self.ticks > 0 and not self.differs
 
 
+def memory_of(text: str, kind: type[State]) -> State:
+    """Return a recorded memory."""
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise RunError(
+            f"a service's memory in the log is no {kind.__name__}: {error}; execute it again with "
+            "the checkout that wrote it (`xrl log info` tells its commit)"
+        ) from None
+
+
 def size(row: Difference) -> float:
     """Return how far apart the two values are; infinite where they are no numbers."""
     a, b = row.recorded, row.recomputed
@@ -203,7 +217,7 @@ FACTS: Final = {
     "architecture": "architecture", "cpu_model": "CPU", "libc": "libc", "python": "Python",
 }  # fmt: skip
 """Facts of `run` by which numbers may differ, with their names in a sentence."""
-NUMERIC_PACKAGES: Final = ("casadi", "msgspec", "numpy", "pin", "scipy")
+NUMERIC_PACKAGES: Final = ("casadi", "msgspec", "numpy", "pin")
 """Packages with which planner and joint services compute."""
 CHANGED: Final = " with changes"
 """After a commit: the checkout has it and more, so two of them may differ."""

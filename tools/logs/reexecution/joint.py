@@ -23,8 +23,8 @@ from shared.bus.messages import (
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tools.logs.reexecution.compare import ReexecutionResult
-from tools.logs.reexecution.inputs import memory_of
+from shared.state import copied
+from tools.logs.reexecution.compare import ReexecutionResult, memory_of
 from tools.logs.run_log import RunLog
 
 _encode: Final = msgspec.json.Encoder().encode
@@ -134,21 +134,21 @@ class JointExecution:
 
     def snapshot(self) -> DriveManagerState | None:
         """Return the service's present state; None while it cannot be executed."""
-        return None if self._loop is None else self._loop.module.snapshot()
+        return None if self._loop is None else copied(self._loop.module.state)
 
     def _remember(self, trace: JointTrace) -> None:
         """Go on from a recorded memory, or hold ours to it."""
         if self._loop is None:
             module = DriveManager(self._robot, self._name)
-            module.restore(memory_of(trace.snapshot, DriveManagerState))
+            module.state = memory_of(trace.snapshot, DriveManagerState)
             self._loop = self._loop_of(module)
             self.outcome.starts += 1
             return
         if self.outcome.exact:
             computed = msgspec.structs.replace(
-                trace, snapshot=_encode(self._loop.module.snapshot()).decode()
+                trace, snapshot=_encode(self._loop.module.state).decode()
             )
-            self._compare("trace", self._loop.module.controller.cycle, trace, computed)
+            self._compare("trace", self._loop.module.state.controller.cycle, trace, computed)
 
     def _loop_of(self, module: DriveManager) -> JointLoop:
         self._cycle = cycle = _Cycle()
@@ -175,7 +175,7 @@ class JointExecution:
         return True
 
     def _execute(self, loop: JointLoop, trace: CycleTrace) -> Iterator[tuple[str, Message]]:
-        step, controller, sent = loop.cycle(), loop.module.controller, self._cycle.sent
+        step, controller, sent = loop.cycle(), loop.module.state.controller, self._cycle.sent
         self.outcome.ticks += 1
         drive_command, tau = step.command.value, controller.tau
         if drive_command != trace.drive_command or tau != trace.tau:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, Generic, TypeVar
 
 import msgspec
@@ -16,12 +17,28 @@ from shared.bus.messages import Attitude, JointCommand, Message, PlannerStatus, 
 from shared.bus.traces import PlannerCheckpoint
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tools.logs.reexecution.compare import ReexecutionResult
-from tools.logs.reexecution.inputs import BySeq, memory_of
+from shared.state import copied
+from tools.logs.reexecution.compare import ReexecutionResult, memory_of
 from tools.logs.run_log import RunLog
 
 M = TypeVar("M", bound=Message)
 _encode: Final = msgspec.json.Encoder().encode
+
+
+class BySeq(Generic[M]):
+    """Finds a sender's message by its number; a restarted sender counts from the start again."""
+
+    def __init__(self, messages: Iterable[M]) -> None:
+        self._rows: dict[int, list[M]] = {}
+        for message in messages:
+            self._rows.setdefault(message.seq, []).append(message)
+
+    def at(self, seq: int, by_ns: int) -> M | None:
+        """Return the newest message of this number that was made by a time; None if none was."""
+        rows = self._rows.get(seq)
+        if not rows:
+            return None
+        return rows[max(0, bisect_right(rows, by_ns, key=lambda row: row.t_ns) - 1)]
 
 
 class _LoggedInbox(Generic[M]):
@@ -118,7 +135,7 @@ class PlannerExecution:
         """Return the planner's session and present state; None while it cannot be executed."""
         if self._loop is None:
             return None
-        return self._loop.planner.session, self._loop.planner.snapshot()
+        return self._loop.planner.session, copied(self._loop.planner.state)
 
     def _begin(self, status: PlannerStatus) -> None:
         """Go on from the memory after this tick, if the log has it."""
@@ -128,13 +145,13 @@ class PlannerExecution:
         known = memory_of(snapshot.snapshot, PlannerState)
         controller = self._controller() if self._controller is not None else None
         planner = Planner(self._robot, status.session, controller)
-        planner.restore(known)
+        planner.state = known
         self._tick = tick = _Tick()
         self._loop = PlannerLoop(self._robot, planner, tick.ports, lambda: tick.t_ns)
         self._taken = (
             [-1 if state is None else state.seq for state in known.states],
-            known.wrench_seq,
-            known.attitude_seq,
+            -1 if known.wrench is None else known.wrench.seq,
+            -1 if known.attitude is None else known.attitude.seq,
         )
         self.outcome.starts += 1
 
@@ -187,7 +204,7 @@ class PlannerExecution:
         yield topics.PLANNER_STATUS.key(self._log_robot), computed
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:
-            text = _encode(loop.planner.snapshot()).decode()
+            text = _encode(loop.planner.state).decode()
             mine_then = msgspec.structs.replace(snapshot, snapshot=text)
             compare("planner/checkpoint", status.seq, snapshot, mine_then)
 

@@ -1,4 +1,4 @@
-"""`xrl drive can`: bring the CAN buses up, listen to them, measure how fast drives answer."""
+"""`xrl drive can`: bring the CAN buses up, listen to them."""
 
 from __future__ import annotations
 
@@ -15,25 +15,21 @@ from shared.can.cansimple import AxisState
 from shared.config.files import load
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
-from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
+from shared.exceptions import FAULT_EXIT_CODE, FleetError
 from shared.places import FILES
-from tools.bringup import check_robot
 from tools.bringup.can_monitor import (
     BusTraffic,
-    RoundTrips,
     bus_config,
     bus_nodes,
     listen_to,
     mean_ms,
-    round_trips,
 )
-from tools.bringup.check_socketcan import interfaces_of, setup_commands
+from tools.bringup.check_host import interfaces_of, setup_commands
 from tools.bringup.drive_access import drives_within_reach
-from tools.flags import Arg, ConfigFlags, Count, Duration, RunDirFlags, option
+from tools.flags import Arg, ConfigFlags, Duration, RunDirFlags, option
 from tools.terminal import Console, marked
 
 COMMAND_S: Final = 10.0
-REQUESTS: Final = 200
 SILENT: Final = Text("silent", "red")
 
 
@@ -41,7 +37,6 @@ EXAMPLES: Final = """
 xrl drive can setup --config lab.toml             # prints the commands
 sudo xrl drive can setup --config lab.toml --apply
 xrl drive can test --config lab.toml --for 5      # listens, sends nothing
-xrl drive can latency --config lab.toml           # asks each axis 200 times; the fleet must be down
 """
 
 
@@ -63,14 +58,7 @@ class TestFlags(CanFlags):
     """How long."""
 
     for_s: Annotated[Duration | None, option("--for")] = None
-    """listen so long"""
-
-
-class LatencyFlags(CanFlags):
-    """How often."""
-
-    count: Annotated[Count, Arg(metavar="N")] = REQUESTS
-    """requests per axis"""
+    """how long to listen"""
 
 
 def set_up(flags: SetUpFlags) -> int:
@@ -99,20 +87,8 @@ def test(flags: TestFlags) -> int:
         return _listen(robot, flags, buses)
 
 
-def latency(flags: LatencyFlags) -> int:
-    """Measure; an axis that does not answer is a fault."""
-    robot = load(flags.config)
-    buses = _buses(robot, flags.bus)
-    with drives_within_reach(robot, flags.config, flags.run_dir):
-        return _measure(robot, flags, buses)
-
-
 def _buses(robot: RobotConfig, only: str | None) -> Mapping[str, tuple[int, ...]]:
-    """Return the nodes of each bus that is asked for.
-
-    Raises:
-        FleetError: there is none of that name.
-    """
+    """Return the nodes of each bus that is asked for."""
     known = bus_nodes(robot)
     if only is None:
         return known
@@ -189,40 +165,3 @@ def _node_table(robot: RobotConfig, traffic: BusTraffic) -> Table:
 
 def _rate(times_s: list[float], seconds: float) -> Text:
     return Text(f"{len(times_s) / seconds:.0f} Hz") if times_s else SILENT
-
-
-def _measure(robot: RobotConfig, flags: LatencyFlags, buses: Mapping[str, tuple[int, ...]]) -> int:
-    """Ask each axis, and print how long it takes.
-
-    Raises:
-        FleetError: joint services are up.
-    """
-    up = check_robot.joint_services_up(robot, flags.run_dir)
-    if up:
-        raise FleetError(
-            f"{', '.join(up)}: up, and a request would feed a drive's watchdog; `xrl down` first"
-        )
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("bus", "node", "median ms", "p99 ms", "largest ms", "lost"):
-        table.add_column(heading, justify="left" if heading == "bus" else "right", no_wrap=True)
-    complete = True
-    for name, nodes in buses.items():
-        try:
-            bus = bus_config(robot, name, flags.run_dir)
-            found = round_trips(bus, nodes, flags.count) if nodes else {}
-        except DriveError as error:
-            raise FleetError(f"bus {name}: {error}; `xrl drive can setup`, `xrl doctor`") from None
-        for node, trips in found.items():
-            table.add_row(name, str(node), *_percentiles(trips), str(trips.lost or ""))
-            complete &= bool(trips.times_ms)
-    Console().print(table)
-    return 0 if complete else FAULT_EXIT_CODE
-
-
-def _percentiles(trips: RoundTrips) -> tuple[str, str, str]:
-    ordered = sorted(trips.times_ms)
-    if not ordered:
-        return "-", "-", "-"
-    chosen = (ordered[len(ordered) // 2], ordered[(99 * len(ordered)) // 100], ordered[-1])
-    middle, late, latest = (f"{value:.2f}" for value in chosen)
-    return middle, late, latest

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,10 +14,28 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError
 from shared.joints import MODULES
-from tools.bringup import backup, calibrate_robot, calibration, changes, drive_access
-from tools.bringup.boards import FIRMWARE, Board, FoundBoards, describe_firmware, is_known
-from tools.bringup.changes import ChangeResult, SettingChange
-from tools.bringup.check_robot import joint_services_up
+from tools.bringup import calibration, drive_access
+from tools.bringup.boards import (
+    FIRMWARE,
+    Backup,
+    Board,
+    ChangeResult,
+    FoundBoards,
+    SettingChange,
+    against_backup,
+    backup_of,
+    changes_to_wanted,
+    describe_firmware,
+    describe_setting,
+    difference_table,
+    is_known,
+    read_backup,
+    refuse_armed,
+    settings_of,
+    write_backup,
+    write_changes,
+)
+from tools.bringup.check_host import joint_services_up
 from tools.bringup.drive_access import (
     DriveSettingFlags,
     boards_on_usb,
@@ -26,8 +43,7 @@ from tools.bringup.drive_access import (
     drives_within_reach,
     no_fleet_meanwhile,
 )
-from tools.bringup.module_motion import LIFTED, exit_if_interrupted
-from tools.bringup.motion_runner import Interrupts
+from tools.bringup.motion_runner import LIFTED, Interrupts, exit_if_interrupted
 from tools.flags import Arg, FleetRobotFlags, Folder, Module
 from tools.fleet.process_table import is_simulated
 from tools.terminal import Console, marked
@@ -85,86 +101,86 @@ def run(flags: ConfigureFlags) -> int:
     console = Console()
     path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
-    saved = backup.read(flags.restore) if flags.restore else None
+    saved = read_backup(flags.restore) if flags.restore else None
     modules = modules_of(flags, robot, saved)
     check_plants(robot, flags.run_dir, flags.plant)
+    looked_at = MODULES if flags.calibrate else modules
     with contextlib.ExitStack() as stack:
         if flags.apply:
             stack.enter_context(no_fleet_meanwhile(robot, flags.run_dir))
-            refuse_services(robot, flags.run_dir, MODULES if flags.calibrate else modules)
-        return look_and_write(flags, console, robot, path, modules, saved)
-
-
-def look_and_write(
-    flags: ConfigureFlags,
-    console: Console,
-    robot: RobotConfig,
-    path: Path,
-    modules: Sequence[str],
-    saved: backup.Backup | None,
-) -> int:
-    """Show what is to do; with `--apply` keep a backup, write, read back, and calibrate."""
-    lifted = LIFTED if flags.calibrate else 0.0
-    looked_at = MODULES if flags.calibrate else modules
-    with (
-        drives_within_reach(robot, path, flags.run_dir, flags.plant, lifted=lifted) as started,
-        boards_on_usb(robot, flags.run_dir, looked_at) as found,
-    ):
+            refuse_services(robot, flags.run_dir, looked_at)
+        lifted = LIFTED if flags.calibrate else 0.0
+        started = stack.enter_context(
+            drives_within_reach(robot, path, flags.run_dir, flags.plant, lifted=lifted)
+        )
+        found = stack.enter_context(boards_on_usb(robot, flags.run_dir, looked_at))
         boards = boards_of(robot, modules, found)
-        axes = calibrate_robot.to_calibrate(boards, again=flags.again) if flags.calibrate else {}
-        marks = {
-            (module, f"{axis}.{mark}")
-            for module, those in axes.items()
-            for axis in those
-            for mark in calibration.MARKS
-        }
-        difference = differences(robot, boards, saved)
-        difference = [each for each in difference if (each.module, each.name) not in marks]
-        console.print(changes.difference_table(difference) if difference else "nothing to change")
-        for module, those in axes.items():
-            console.print(f"to be calibrated: {module}, {' and '.join(those)}")
-        if flags.calibrate and not axes:
-            console.print("every axis is calibrated; --again calibrates them once more")
-        if not flags.apply or not (difference or axes):
-            if difference or axes:
-                console.print("\nnothing was written; `--apply` does it")
+        axes = calibration.to_calibrate(boards, again=flags.again) if flags.calibrate else {}
+        difference = differences(robot, boards, saved, axes)
+        if not _show(console, flags, difference, axes) or not flags.apply:
             return FAULT_EXIT_CODE if difference or axes else 0
-        for module, board in boards.items():
-            changes.refuse_armed(module, board)
-        if axes:
-            calibrate_robot.refuse_standing(robot, flags.run_dir, found, axes)
-        kept = keep(flags.out, boards, path)
-        restore = f"`xrl drive configure --restore {shlex.quote(str(kept))}`"
-        console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
         interrupts = Interrupts()
-        with interrupts.kept():
-            outcomes = apply(console, boards, difference, interrupts)
-        code = conclude(console, robot, outcomes) if difference else 0
-        if interrupts.number:
-            begun = {outcome.change.module for outcome in outcomes}
-            rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
-            console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
-            sys.exit(128 + interrupts.number)
-        if axes and not code:
-            code = calibrate_robot.calibrate(
-                console, robot, {module: (boards[module], axes[module]) for module in axes},
-                interrupts, yes=flags.yes,
-                check=lambda: refuse_services(robot, flags.run_dir, MODULES),
-            )  # fmt: skip
+        code = _write(flags, console, (robot, path), boards, difference, axes, found, interrupts)
     if started and is_simulated(robot):
         console.print(drive_access.GONE)
     exit_if_interrupted(interrupts)
     return code
 
 
-def modules_of(
-    flags: ConfigureFlags, robot: RobotConfig, saved: backup.Backup | None
-) -> tuple[str, ...]:
-    """Return the modules that are meant: those that were named, or of the backup, or all.
+def _show(
+    console: Console,
+    flags: ConfigureFlags,
+    difference: Sequence[SettingChange],
+    axes: Mapping[str, Sequence[str]],
+) -> bool:
+    """Print what is to do; return False if it is nothing."""
+    console.print(difference_table(difference) if difference else "nothing to change")
+    for module, those in axes.items():
+        console.print(f"to be calibrated: {module}, {' and '.join(those)}")
+    if flags.calibrate and not axes:
+        console.print("every axis is calibrated; --again calibrates them once more")
+    if (difference or axes) and not flags.apply:
+        console.print("\nnothing was written; `--apply` does it")
+    return bool(difference or axes)
 
-    Raises:
-        DriveError: the backup does not have one of them, or has it with another board.
-    """
+
+def _write(
+    flags: ConfigureFlags,
+    console: Console,
+    file: tuple[RobotConfig, Path],
+    boards: Mapping[str, Board],
+    difference: Sequence[SettingChange],
+    axes: Mapping[str, Sequence[str]],
+    found: FoundBoards,
+    interrupts: Interrupts,
+) -> int:
+    """Keep a backup, write, read back, and calibrate; return the exit code."""
+    robot, path = file
+    for module, board in boards.items():
+        refuse_armed(module, board)
+    if axes:
+        calibration.refuse_standing(robot, flags.run_dir, found, axes)
+    kept = keep(flags.out, boards, path)
+    restore = f"`xrl drive configure --restore {shlex.quote(str(kept))}`"
+    console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
+    with interrupts.kept():
+        outcomes = apply(console, boards, difference, interrupts)
+    code = conclude(console, robot, outcomes) if difference else 0
+    if interrupts.number:
+        begun = {outcome.change.module for outcome in outcomes}
+        rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
+        console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
+        exit_if_interrupted(interrupts)
+    if code or not axes:
+        return code
+    return calibration.calibrate(
+        console, robot, {module: (boards[module], axes[module]) for module in axes},
+        interrupts, yes=flags.yes, check=lambda: refuse_services(robot, flags.run_dir, MODULES),
+    )  # fmt: skip
+
+
+def modules_of(flags: ConfigureFlags, robot: RobotConfig, saved: Backup | None) -> tuple[str, ...]:
+    """Return the named modules, or those of the backup, which must be of the same boards."""
     if saved is None:
         return tuple(flags.module or MODULES)
     by_module = {board.module: board for board in saved.boards}
@@ -183,11 +199,7 @@ def modules_of(
 
 
 def refuse_services(robot: RobotConfig, run_dir: Path, modules: Sequence[str]) -> None:
-    """Refuse to write where a joint service has one of the drives.
-
-    Raises:
-        FleetError: naming it, and what to do.
-    """
+    """Refuse to write where a joint service has one of the drives."""
     for service in joint_services_up(robot, run_dir):
         if service in modules:
             raise FleetError(
@@ -199,11 +211,7 @@ def refuse_services(robot: RobotConfig, run_dir: Path, modules: Sequence[str]) -
 
 
 def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) -> dict[str, Board]:
-    """Return the boards by module, every one of them.
-
-    Raises:
-        DriveError: one is not there, or has a firmware whose settings are not known here.
-    """
+    """Return the boards by module; every one must be there, with a firmware that is known here."""
     boards = {}
     for module in modules:
         serial = robot.module_named(module).serial_number.upper()
@@ -224,19 +232,20 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) ->
 
 
 def differences(
-    robot: RobotConfig, boards: Mapping[str, Board], saved: backup.Backup | None
+    robot: RobotConfig,
+    boards: Mapping[str, Board],
+    saved: Backup | None,
+    axes: Mapping[str, Sequence[str]] | None = None,
 ) -> list[SettingChange]:
-    """Return everything that is to be changed, module by module.
+    """Return everything to change, module by module, but the marks of axes to be calibrated.
 
-    Raises:
-        DriveError: a board does not answer, or has another firmware than its backup.
+    A backup must be of the same firmware: settings may mean something else in another.
     """
     rows: list[SettingChange] = []
     kept = {board.module: board for board in saved.boards} if saved else {}
     for module, board in boards.items():
         if saved is None:
-            wanted = drive_settings.of_module(robot, module)
-            rows += changes.changes_to_wanted(module, wanted, board)
+            rows += changes_to_wanted(module, drive_settings.of_module(robot, module), board)
             continue
         firmware = describe_firmware(board.firmware)
         if firmware != kept[module].firmware:
@@ -244,19 +253,21 @@ def differences(
                 f"{module}: the backup is of firmware {kept[module].firmware}, the board has "
                 f"{firmware}: settings may mean something else there"
             )
-        rows += changes.against_backup(module, backup.settings_of(kept[module]), board)
-    return rows
+        rows += against_backup(module, settings_of(kept[module]), board)
+    marks = {
+        (module, f"{axis}.{mark}")
+        for module, those in (axes or {}).items()
+        for axis in those
+        for mark in calibration.MARKS
+    }
+    return [row for row in rows if (row.module, row.name) not in marks]
 
 
 def keep(folder: Path, boards: Mapping[str, Board], robot_file: Path) -> Path:
-    """Write all settings of the boards into a new file and return its path.
-
-    Raises:
-        DriveError: it cannot be written, or a board does not answer.
-    """
+    """Write all settings of the boards into a new file and return its path."""
     path = folder / time.strftime("%Y%m%d-%H%M%S.json")
-    rows = [backup.of_board(module, board) for module, board in boards.items()]
-    backup.write(path, rows, time=time.strftime("%Y-%m-%dT%H:%M:%S%z"), robot_file=str(robot_file))
+    rows = [backup_of(module, board) for module, board in boards.items()]
+    write_backup(path, rows, time=time.strftime("%Y-%m-%dT%H:%M:%S%z"), robot_file=str(robot_file))
     return path
 
 
@@ -278,7 +289,7 @@ def apply(
             continue
         try:
             with console.status(f"{module}: writing, saving, restarting"):
-                outcomes += changes.apply(board, serial)
+                outcomes += write_changes(board, serial)
         except DriveError as error:
             console.print(marked("[bold red]{}[/]: {}", module, error))
             outcomes += [ChangeResult(change, None, good=False) for change in serial]
@@ -289,7 +300,7 @@ def conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResu
     """Say what came of it and return the exit code."""
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:
-        what = change.inhibit or f"it is {changes.describe(now)} after the restart"
+        what = change.inhibit or f"it is {describe_setting(now)} after the restart"
         console.print(
             marked("[bold red]not as wanted[/]: {} {}: {}", change.module, change.name, what)
         )

@@ -12,7 +12,7 @@ from shared.bus.ports import Inbox, Outbox
 from shared.bus.session import open_session
 from shared.clock import now_ns
 from shared.exceptions import FleetError
-from shared.user import user_name
+from shared.places import user_name
 from tools.flags import Arg, RunDirFlags
 from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console

@@ -36,7 +36,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import JOINTS, MODULES, N_JOINTS
 from shared.robot.robot_model import stand_pose
-from shared.text_file import read_text
+from shared.toml_file import read_text
 from tools.flags import Arg, Flags, Number, Run, finite_numbers, robot_file_of
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.push_limit import PushLimits

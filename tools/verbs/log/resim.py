@@ -12,7 +12,7 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from services.planner.controller_file import controller_maker
+from services.planner.controller import controller_maker
 from shared import revision
 from shared.bus.messages import Message
 from shared.exceptions import FAULT_EXIT_CODE, RunError

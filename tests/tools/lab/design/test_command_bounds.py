@@ -10,15 +10,14 @@ from services.planner.planner import Planner
 from shared.bus.messages import Outside
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
-from tests.planner.conftest import Closed
-from tests.planner.states import SESSION, START_NS, receive_all
+from tests.planner.states import SESSION, START_NS, closed, receive_all
 
 
 @pytest.mark.parametrize("height", [0.8, 0.95, 1.05, 1.188])
 @pytest.mark.parametrize("pitch", [-0.3, 0.0, 0.6, 1.2])
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_what_the_law_sends_in_a_stand_is_believed(
-    robot: RobotConfig, closed: Closed, height: float, pitch: float, share: float
+    robot: RobotConfig, height: float, pitch: float, share: float
 ) -> None:
     planner, q = Planner(robot, SESSION), closed(height, pitch=pitch)
     planner.receive_request(OperatorRequest(share * robot.assist.force_max))

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from services.planner.law.certificate import Margins
-from services.planner.law.inverse_kinematics import InverseKinematics
 from shared.arrays import Array
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
-from tests.planner.conftest import at_pose, com_height
-from tests.planner.stands import Stand
+from tests.planner.states import Stand, at_pose, com_height, shipped_ik
 from tools.lab.design import design_program, split_program
 from tools.lab.design.dynamic_certificate import TRACK, DynamicCertificate
 
@@ -43,12 +41,12 @@ def solved(robot: RobotConfig, progress: list[tuple[int, int]]) -> GainSchedule:
 
 @pytest.fixture(scope="module", params=NODES, ids=lambda n: f"node{n[0]}-{n[1]}")
 def node(
-    request: pytest.FixtureRequest, robot: RobotConfig, ik: InverseKinematics, solved: GainSchedule
+    request: pytest.FixtureRequest, robot: RobotConfig, solved: GainSchedule
 ) -> tuple[Array, Stand, Stand]:
     """Return a node's D (6,), and the stand there without and with the full assist."""
     i, j = request.param
     p = np.array([0.0, 0.0, solved.z[i], 0.0, solved.pitch[j], 0.0])
-    q = at_pose(robot, ik, p, np.array(stand_pose(robot, 1.1)))
+    q = at_pose(robot, shipped_ik(), p, np.array(stand_pose(robot, 1.1)))
     unloaded, loaded = Stand(robot, q, 0.0), Stand(robot, q, robot.assist.force_max)
     return np.array(solved.D[i][j]), unloaded, loaded
 

@@ -104,7 +104,7 @@ RUN = {
     "libc": "glibc 2.36", "python": "3.11.2", "platform": "Linux-6.1", "cpu_count": "2",
     "thread_env": '{"OPENBLAS_NUM_THREADS":"1"}',
 }  # fmt: skip
-PACKAGES = {"casadi": "3.8", "msgspec": "0.22", "numpy": "2.4", "pin": "4.1", "scipy": "1.17"}
+PACKAGES = {"casadi": "3.8", "msgspec": "0.22", "numpy": "2.4", "pin": "4.1"}
 
 
 def origin(**changes: str) -> Origin:

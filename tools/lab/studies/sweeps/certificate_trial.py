@@ -19,12 +19,12 @@ import msgspec
 import numpy as np
 
 from services.joint import differential
+from services.joint.differential import limit_torque, limits_of
 from services.joint.pd_law import ZERO, Setpoint, torque
-from services.joint.torque_limiter import limit_torque, limits_of
 from services.planner.law.certificate import Certificate, Weakest
-from services.planner.law.gains import GainLaw
 from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
+from services.planner.law.split import GainLaw
 from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import IDEAL, PlantConfig, changed
 from services.simulator.physics.world import World

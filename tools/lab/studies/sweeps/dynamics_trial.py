@@ -249,7 +249,7 @@ def _take_over(fleet: Lockstep, robot: RobotConfig) -> None:
     before = fleet.planner
     assert before is not None  # noqa: S101 - nobody kills it
     fleet.planner = Planner(robot, before.session)
-    fleet.planner.restore(before.snapshot())
+    fleet.planner.state = before.state
 
 
 def _predicted(fleet: Lockstep, robot: RobotConfig, trial: DynamicsTrial) -> DynamicsResult | None:

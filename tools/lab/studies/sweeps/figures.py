@@ -15,7 +15,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
 from tools.judge.standing import is_tipping
 from tools.sim.lockstep import Watch, forget
-from tools.sim.virtual_time import Record
+from tools.sim.virtual_services import Record
 
 END_TOLERANCE_S: Final = 0.1
 

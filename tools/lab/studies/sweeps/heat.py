@@ -40,8 +40,7 @@ from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Study, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.output import new_figure, save_figure
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 from tools.terminal import Console
 
 EXAMPLES: Final = """

@@ -40,7 +40,7 @@ from tools.lab.studies.sweeps.figures import (
 )
 from tools.lab.studies.sweeps.push_range import DIGITS, SHARE, PushRange, uniform
 from tools.sim.lockstep import Lockstep
-from tools.sim.virtual_time import Record
+from tools.sim.virtual_services import Record
 
 PAYLOADS: Final = 5
 """kg, evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""

@@ -40,9 +40,9 @@ from tools.lab.studies.sweeps.figures import (
 )
 from tools.lab.studies.sweeps.push_range import SHARE, PushRange, uniform
 from tools.lab.studies.sweeps.table import plain
-from tools.sim.centralised.fleet import CentralisedLockstep
+from tools.sim.centralised import CentralisedLockstep
 from tools.sim.lockstep import Lockstep
-from tools.sim.virtual_time import Record
+from tools.sim.virtual_services import Record
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
 """s, and m below the stand: as in the paper's Fig. 7, at its pace."""

@@ -23,8 +23,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.exceptions import RunError
 from shared.places import SCENARIOS
 from shared.robot.trip_table import JOINT_TRIPS, untripped
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 SMALL_ERRORS: Final[Mapping[str, Any]] = {
     "encoder.zero_errors": [math.radians(0.5) * (-1) ** i for i in range(12)],

@@ -5,8 +5,7 @@ from typing import Any
 import pytest
 
 from tools.lab.studies.sweeps import dynamics_trial, kill_trial
-from tools.sim.lockstep import Lockstep
-from tools.sim.standing_start import begin_standing
+from tools.sim.lockstep import Lockstep, begin_standing
 
 
 @pytest.fixture

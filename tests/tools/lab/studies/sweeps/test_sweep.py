@@ -352,10 +352,10 @@ def test_the_digest_has_every_tool_that_decides_a_run_and_no_picture() -> None:
     sweeps = "tools/lab/studies/sweeps"
     for one, own in (
         (kill.STUDY, {f"{sweeps}/kill_trial.py", "tools/lab/design/split_program.py"}),
-        (latency.STUDY, {f"{sweeps}/latency_trial.py", "tools/sim/centralised/control.py"}),
+        (latency.STUDY, {f"{sweeps}/latency_trial.py", "tools/sim/centralised.py"}),
     ):
         code = one.code
-        runs = ("lockstep", "network", "virtual_drive", "virtual_services", "virtual_time")
+        runs = ("lockstep", "network", "virtual_drive", "virtual_services")
         assert {"services", "shared", *(f"tools/sim/{name}.py" for name in runs)} | own <= {*code}
         assert [part for part in code if "picture" in part or "report" in part] == []
 

@@ -1,0 +1,205 @@
+"""The hand: how it moves when led, and its force as a clipped spring-damper at the harness."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.simulator.physics import operator as hands
+from services.simulator.physics.operator import BANDWIDTH, LedHand, Operator, Wearer, follow
+from services.simulator.physics.plant import IDEAL, Person
+from shared.bus.messages import HandLead
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Lead
+
+DT = 0.001
+NOW = Lead(1.1, -0.05, 0.1, 0.02, 30.0)
+NUMBER = st.floats(allow_nan=True, allow_infinity=True)
+
+
+def asked(**fields: object) -> HandLead:
+    rest = {"t_ns": 1, "seq": 1, "leads": True, "height": 0.0, "pitch": 0.0, "push": (0, 0, 0)}
+    return msgspec.convert(rest | fields, HandLead)
+
+
+@given(st.lists(st.tuples(NUMBER, NUMBER), min_size=1, max_size=20))
+def test_it_never_jumps_and_never_leaves_its_limits(places: list[tuple[float, float]]) -> None:
+    hand = LedHand()
+    hand.ask(asked(height=NOW.height, pitch=NOW.pitch), NOW)
+    before = hand.over(NOW)
+    assert before[:4] == NOW[:4], "it begins where the hand is"
+    for height, pitch in places:
+        hand.ask(asked(height=height, pitch=pitch), NOW)
+        for _ in range(20):
+            hand.advance(DT)
+            now = hand.over(NOW)
+            assert abs(now.height - before.height) <= hands.HEIGHT_MAX_RATE * DT + 1e-12
+            assert abs(now.pitch - before.pitch) <= hands.PITCH_MAX_RATE * DT + 1e-12
+            before = now
+    for _ in range(400):
+        hand.advance(50 * DT)
+    low, high = hands.HEIGHTS
+    assert low - 1e-6 <= hand.over(NOW).height <= high + 1e-6
+    assert hand.over(NOW).assist == NOW.assist, "the assist stays the scenario's"
+
+
+def test_a_hand_stays_where_it_was_led_and_its_push_expires() -> None:
+    hand = LedHand()
+    hand.ask(asked(height=0.95, pitch=0.3), NOW)
+    for _ in range(5000):
+        hand.advance(DT)
+    assert hand.over(NOW).height == pytest.approx(0.95, abs=1e-4)
+    assert hand.over(NOW).pitch == pytest.approx(0.3, abs=1e-4)
+    hand = LedHand()
+    hand.ask(asked(leads=False, push=(0.0, 1e6, -3.0)), NOW)
+    assert hand.push == (0.0, hands.PUSH_MAX, -3.0)
+    assert hand.over(NOW) == NOW
+    for _ in range(math.ceil(hands.PUSH_EXPIRES_S / DT) + 1):
+        hand.advance(DT)
+    assert hand.push is None
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("field", ["height", "pitch", "push"])
+def test_what_is_no_number_is_ignored(field: str, wrong: float) -> None:
+    hand = LedHand()
+    hand.ask(asked(height=1.0, pitch=0.0, push=(1.0, 0.0, 0.0)), NOW)
+    before = hand.numbers()
+    given = (wrong, 0.0, 0.0) if field == "push" else wrong
+    hand.ask(asked(**{"height": 0.9, "pitch": 0.5, field: given}), NOW)
+    assert hand.numbers() == before
+
+
+@given(st.booleans(), st.floats(0.7, 1.3), st.floats(-1, 1), st.integers(0, 400))
+def test_a_hand_made_of_the_logs_numbers_goes_on_bit_for_bit(
+    leads: bool, height: float, pitch: float, steps: int
+) -> None:
+    hand = LedHand()
+    hand.ask(asked(leads=leads, height=height, pitch=pitch, push=(5.0, 0.0, 1.0)), NOW)
+    for _ in range(steps):
+        hand.advance(DT)
+    other = LedHand.of_numbers(hand.numbers())
+    for _ in range(200):
+        hand.advance(DT)
+        other.advance(DT)
+        assert other.numbers() == hand.numbers()
+        assert (other.over(NOW), other.push) == (hand.over(NOW), hand.push)
+
+
+RATE_MAX = 0.5
+PLACES = st.floats(-10.0, 10.0)
+
+
+@given(st.lists(st.tuples(PLACES, st.floats(1e-4, 2.0)), max_size=30))
+def test_a_coordinate_never_moves_faster_than_its_limit_whatever_the_step(
+    asked: list[tuple[float, float]],
+) -> None:
+    at = rate = 0.0
+    for wanted, dt in asked:
+        before = at
+        at, rate = follow(wanted, at, rate, RATE_MAX, dt)
+        assert abs(at - before) <= RATE_MAX * dt + 1e-9
+        assert abs(rate) <= RATE_MAX + 1e-9
+        assert math.isfinite(at)
+
+
+@given(PLACES, st.integers(1, 20))
+def test_a_coordinate_arrives_without_overshoot_and_rests(wanted: float, per_10_ms: int) -> None:
+    at, rate, dt = 0.0, 0.0, 0.01 / per_10_ms
+    for _ in range(round((abs(wanted) / RATE_MAX + 20.0 / BANDWIDTH) / dt)):
+        at, rate = follow(wanted, at, rate, RATE_MAX, dt)
+        assert abs(at) <= abs(wanted) + 1e-3
+    assert abs(at - wanted) < 1e-3
+    assert abs(rate) < 1e-2
+
+
+def test_within_its_limit_a_coordinate_is_the_critically_damped_solution() -> None:
+    at, rate, dt, wanted = 0.0, 0.0, 1e-3, 0.01
+    for step in range(1, 1000):
+        at, rate = follow(wanted, at, rate, RATE_MAX, dt)
+        w_t = BANDWIDTH * step * dt
+        assert abs(at - wanted * (1.0 - (1.0 + w_t) * math.exp(-w_t))) < 1e-9
+
+
+LEVEL = Lead(height=1.1, height_rate=0.0, pitch=0.0, pitch_rate=0.0, assist=0.0)
+
+
+@pytest.fixture
+def operator(robot: RobotConfig) -> Operator:
+    return Operator(robot.simulation.operator, robot.geometry.harness_point)
+
+
+def harness_height(robot: RobotConfig, height: float, pitch: float) -> float:
+    x, _, z = robot.geometry.harness_point
+    return height - x * math.sin(pitch) + z * math.cos(pitch)
+
+
+@pytest.mark.parametrize("pitch", [-0.2, 0.0, 0.6, 1.2])
+def test_the_hand_rests_where_it_leads_and_does_not_drag(
+    robot: RobotConfig, operator: Operator, pitch: float
+) -> None:
+    wanted = LEVEL._replace(pitch=pitch)
+    hand = operator.force(wanted, harness_height(robot, 1.1, pitch), 0.0, pitch, 0.0)
+    assert hand == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_the_hand_moving_with_its_path_does_not_drag(
+    robot: RobotConfig, operator: Operator
+) -> None:
+    """The harness point's own rate, from the path's height and pitch, by difference."""
+    dt, pitch, rates = 1e-6, 0.7, (-0.2, 0.3)
+    ahead = harness_height(robot, 1.1 + rates[0] * dt, pitch + rates[1] * dt)
+    rate = (ahead - harness_height(robot, 1.1, pitch)) / dt
+    wanted = Lead(height=1.1, height_rate=rates[0], pitch=pitch, pitch_rate=rates[1], assist=0.0)
+    hand = operator.force(wanted, harness_height(robot, 1.1, pitch), rate, pitch, rates[1])
+    assert hand == pytest.approx((0.0, 0.0), abs=1e-4)
+
+
+def test_the_hand_is_a_spring_and_a_damper_in_each_direction_it_holds(
+    robot: RobotConfig, operator: Operator
+) -> None:
+    hand, at = robot.simulation.operator, 1.1 + robot.geometry.harness_point[2]
+    assert operator.force(LEVEL, at - 0.02, 0.0, 0.0, 0.0).force_z == pytest.approx(0.02 * hand.k_z)
+    assert operator.force(LEVEL, at, 0.1, 0.0, 0.0).force_z == pytest.approx(-0.1 * hand.b_z)
+    turned = operator.force(LEVEL, at, 0.0, 0.1, 0.0)
+    assert turned.moment_pitch == pytest.approx(-0.1 * hand.k_pitch)
+    turning = operator.force(LEVEL, at, 0.0, 0.0, 0.1)
+    assert turning.moment_pitch == pytest.approx(-0.1 * hand.b_pitch)
+    hand, held = robot.simulation.operator, LEVEL._replace(side=0.03, side_rate=0.1)
+    assert operator.force_side(held, 0.01, 0.1) == pytest.approx(0.02 * hand.k_y)
+    assert operator.force_side(held, 0.03, 0.0) == pytest.approx(0.1 * hand.b_y)
+    assert operator.force_side(held, -1.0, 0.0) == hand.force_max
+    assert operator.force_side(LEVEL, 0.5, 1.0) == 0.0, "nothing holds it"
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("far", [0.2, 10.0])
+def test_the_hand_is_no_stronger_than_a_person(
+    robot: RobotConfig, operator: Operator, sign: float, far: float
+) -> None:
+    hand = robot.simulation.operator
+    got = operator.force(LEVEL, 1.1 - sign * far, 0.0, -2 * sign * far, 0.0)
+    assert got == (sign * hand.force_max, sign * hand.moment_max)
+
+
+def worn(person: Person, force: float, assist: float = 0.0, seconds: float = 5.0) -> Wearer:
+    wearer = Wearer(person)
+    for _ in range(round(seconds / 1e-3)):
+        wearer.step(1e-3, force, assist)
+    return wearer
+
+
+def test_the_wearer_gives_way_by_weight_on_springs_and_rests_later_and_less_than_asked() -> None:
+    person = Person(mass=80.0, leg_frequency_hz=2.5)
+    stiffness = 80.0 * (2.0 * math.pi * 2.5) ** 2
+    assert worn(person, -60.0).above == pytest.approx(60.0 / stiffness, rel=1e-3)
+    assert worn(person, 0.0).above == 0.0
+    assert worn(IDEAL.person, 150.0).above == 0.0
+    person = Person(load_scale=0.9, load_lag_s=0.2)
+    assert worn(person, 0.0, 200.0, 0.2).load_n == pytest.approx(0.9 * 200.0 * 0.632, rel=0.01)
+    assert worn(person, 0.0, 200.0).load_n == pytest.approx(180.0, rel=1e-3)
+    assert worn(IDEAL.person, 0.0, 200.0, 1e-3).load_n == 200.0

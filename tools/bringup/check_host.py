@@ -1,0 +1,404 @@
+"""Checks of this host: computer, kernel's CAN interfaces, robot file, bus, keys."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import shlex
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from shared import scheduling
+from shared.bus import security
+from shared.bus.credentials import keys_folder
+from shared.can.drive_settings import CAN_BAUD_RATE
+from shared.config import gain_schedule
+from shared.config.robot_config import RobotConfig, expand
+from shared.exceptions import FleetError, XrlError
+from shared.extras import libusb_fix
+from shared.joints import MODULES
+from shared.places import FILES
+from shared.robot.compiled_graph import library_of
+from tools.bringup.findings import Finding, advised, judged, ok, warning, wrong
+from tools.fleet import process_table
+from tools.fleet.process_table import ListenPoint, is_simulated
+from tools.graph_libraries import command, graphs_of
+from tools.keys.inspection import KeyRow, inspect_keys
+
+MACHINE: Final = "machine"
+CPUS_MIN: Final = 2
+CPUS_FOR_1_KHZ: Final = 4
+"""Two carry the fleet at 500 Hz (docs/results.md)."""
+CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
+"""Clock sources that are read without a system call."""
+ODRIVE_VENDOR: Final = "1209"
+ODRIVE_PRODUCTS: Final = tuple(f"0d3{i}" for i in range(1, 10))
+"""As in deploy/udev/91-odrive.rules."""
+UDEV_FIX: Final = (
+    f"`sudo cp {FILES}/udev/91-odrive.rules /etc/udev/rules.d/`, then follow its header; "
+    "plug in again"
+)
+LIMIT_FIX: Final = (
+    "`YOU - {} {}` in /etc/security/limits.d/xrl.conf and log in again, or systemd's Limit{}={}"
+)
+CLOCK_FIX: Final = "`sudo apt-get install chrony`, or `sudo timedatectl set-ntp true`"
+RTPRIO_FIX: Final = LIMIT_FIX.format("rtprio", 40, "RTPRIO", 40)
+MEMLOCK_FIX: Final = LIMIT_FIX.format("memlock", "unlimited", "MEMLOCK", "infinity")
+
+_TIMEX_BYTES: Final = 256
+"""At least the size of `struct timex` of <sys/timex.h>; all zeros ask and change nothing."""
+_TIME_ERROR: Final = 5
+"""State of a clock that is not synchronised."""
+
+
+Links = Mapping[str, Mapping[str, Any]]
+"""By interface: what `ip` says of it."""
+
+QUEUE: Final = (32, 100)
+"""Frames. deploy/udev/92-can.rules sets 64 and says why; the kernel's default is 10. More than 100
+take longer than a joint service waits for a frame to be carried (`bus_watch.STUCK_MS`)."""
+_IP: Final = ("ip", "-details", "-json", "link", "show", "type", "can")
+_IP_S = 2.0
+_IFF_UP = 1
+_CAP_NET_ADMIN = 12
+_WELL: Final = "ERROR-ACTIVE"
+_OFF: Final = ("BUS-OFF", "STOPPED", "SLEEPING")
+
+
+FILE: Final = "robot file"
+
+
+def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
+    """Check the computer; another root of the file system for tests."""
+    emulated = is_simulated(robot)
+    rows = [_cpus(), _real_time(emulated=emulated), *_delays(root, emulated=emulated)]
+    # interpreted, the law's graphs only cost more time
+    graphs = graphs_of(robot)
+    there = sum(library_of(graph).is_file() for graph in graphs)
+    fix = f"with a C compiler `cc`: `{command()} --config FILE`"
+    found = f"{there} of {len(graphs)} in C"
+    rows.append(advised(there == len(graphs), MACHINE, "law's graphs", found, "all in C", fix))
+    if emulated:
+        return rows
+    if any(module.serial_number for module in robot.module):
+        rows += [_libusb(), *usb_node_rows(root)]
+    return rows + socketcan_rows(robot, root, query_ip())
+
+
+def usb_node_rows(root: Path) -> list[Finding]:
+    """Check that the ODrives on USB may be opened by this user."""
+    nodes = []
+    for device in sorted((root / "sys/bus/usb/devices").glob("*")):
+        vendor, product = _text(device / "idVendor"), _text(device / "idProduct")
+        if vendor == ODRIVE_VENDOR and product in ODRIVE_PRODUCTS:
+            bus, number = _text(device / "busnum"), _text(device / "devnum")
+            nodes.append(root / f"dev/bus/usb/{int(bus):03d}/{int(number):03d}")
+    if not nodes:
+        fix = "plug the USB cables in; settings are read over USB"
+        return [warning("USB", "ODrives", "none plugged in", "one for each module", fix)]
+    closed = [str(node) for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
+    found = f"{len(closed)} closed" if closed else f"{len(nodes)} open"
+    return [judged(not closed, "USB", "permission", found, "read and write", UDEV_FIX)]
+
+
+def _cpus() -> Finding:
+    cpus = os.sched_getaffinity(0)
+    if len(cpus) < CPUS_MIN:
+        fix = "another computer, or more of this one's processors (taskset, container)"
+        return warning(MACHINE, "processors", str(len(cpus)), f">= {CPUS_MIN}", fix)
+    wanted = f">= {CPUS_MIN}; {CPUS_FOR_1_KHZ} for 1 kHz"
+    right, left = (
+        ",".join(map(str, sorted(scheduling.half_of(cpus, kind))))
+        for kind in ("harness", "planner")
+    )
+    found = f"{len(cpus)}: right leg {right} | {left} left leg, planner"
+    return ok(MACHINE, "processors", found, wanted)
+
+
+def _delays(root: Path, *, emulated: bool) -> list[Finding]:
+    """Check what makes a loop late now and then; all of it is ok on an emulated robot."""
+    governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
+    governor = " and ".join(sorted({_text(file) for file in governors} - {""}))
+    clock = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
+    synchronised = clock_is_synchronised()
+    may_lock, areas = scheduling.may_lock(), len(_text(root / "proc/swaps").splitlines()) - 1
+    locked = f"refused: {resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] // 1024} KiB"
+    pause_ms = scheduling.real_time_pause_ms(root)
+    rows = (
+        (governor in ("", "performance"), "frequency governor", governor or "unknown here",
+         "performance", "`sudo cpupower frequency-set -g performance`",
+         "a processor that sleeps is late"),
+        (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or alike",
+         "see in the kernel's log why it was dropped",
+         "every read of the clock costs a system call"),
+        (synchronised, "wall clock", "synchronised" if synchronised else "not synchronised",
+         "synchronised", CLOCK_FIX,
+         "certificates go by it, and records of several hosts are merged by it"),
+        (may_lock, "locked memory", "allowed" if may_lock else locked, "allowed", MEMLOCK_FIX,
+         "a page that must be read from disk stops a loop"),
+        (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
+         "`sudo swapoff -a`",
+         "a service that may not lock its memory stops for a page that was swapped out"),
+        (pause_ms <= 0.0, "real-time pause", f"{pause_ms:g} ms" if pause_ms else "none", "none",
+         f"`sudo cp {FILES}/sysctl/90-xrl.conf /etc/sysctl.d/ && sudo sysctl --system`",
+         "for that time of each second the kernel stops what fills a processor: modules hold"),
+    )  # fmt: skip
+    return [advised(good or emulated, MACHINE, *row) for good, *row in rows]
+
+
+def clock_is_synchronised() -> bool:
+    """Return True if chrony, systemd-timesyncd or another program keeps the wall clock right."""
+    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
+    return int(state) != _TIME_ERROR
+
+
+def _real_time(*, emulated: bool) -> Finding:
+    what, wanted = "real-time priority", "SCHED_FIFO"
+    if _may_be_fifo():
+        return ok(MACHINE, what, "SCHED_FIFO allowed", wanted)
+    fallback = scheduling.short_slice()
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    why = f"the services take {fallback} instead: late when the machine is busy"
+    if fallback == "normal priority":
+        why = "the loops come late when the machine is busy"
+    elif emulated:
+        return ok(MACHINE, what, f"refused; instead: {fallback}", wanted)
+    return warning(MACHINE, what, f"refused, RTPRIO {limit}", wanted, RTPRIO_FIX, why)
+
+
+def _may_be_fifo() -> bool:
+    """Try it and go back: limits, capabilities and control groups all have their say."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(scheduling.TABLE["joint"].fifo))
+    except OSError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+def _libusb() -> Finding:
+    what, wanted = "libusb-1.0", "installed"
+    try:
+        ctypes.CDLL("libusb-1.0.so.0")
+    except OSError:
+        return wrong("USB", what, "not found", wanted, libusb_fix(), "no ODrive over USB")
+    return ok("USB", what, wanted, wanted)
+
+
+def _text(path: Path) -> str:
+    """Return the contents of a small file of the kernel; "" if it does not exist."""
+    try:
+        return path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        return ""
+
+
+def query_ip() -> Links:
+    """Return the output of `ip` for the CAN interfaces; nothing without that command."""
+    try:
+        output = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout
+        return {link["ifname"]: link for link in json.loads(output or "[]") if "ifname" in link}
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return {}
+
+
+def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding]:
+    """Check every interface that the robot uses, by the file system and by `query_ip`."""
+    rows = []
+    for name in interfaces_of(robot):
+        flags = _flags(root, name)
+        if flags is None:
+            fix = "plug the adapter in; `ip link` lists what is there"
+            rows.append(wrong(name, "interface", "not there", "up", fix))
+            continue
+        up = bool(flags & _IFF_UP)
+        rows.append(judged(up, name, "interface", "up" if up else "down", "up", up_command(name)))
+        if up and name in links:
+            rows += _details(root, name, links[name])
+    return rows
+
+
+def interfaces_of(robot: RobotConfig) -> list[str]:
+    """Return the interfaces that a robot's buses use."""
+    used = [robot.can[name] for name in robot.buses]
+    return sorted({bus.channel for bus in used if bus.interface == "socketcan"})
+
+
+def setup_commands(name: str) -> list[list[str]]:
+    """Return the commands that bring an interface up as the drives and services need it."""
+    up = ["type", "can", "bitrate", str(CAN_BAUD_RATE), "restart-ms", "100"]
+    return [
+        ["ip", "link", "set", name, "down"],
+        ["ip", "link", "set", name, "up", *up],
+        ["ip", "link", "set", name, "txqueuelen", "64"],
+    ]
+
+
+def up_command(name: str) -> str:
+    """Return how an interface is brought up."""
+    return f"`sudo ip link set {name} up type can bitrate {CAN_BAUD_RATE} restart-ms 100`"
+
+
+def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
+    """Judge an interface that is up by the output of `ip`; a missing value is not judged."""
+    data = link.get("linkinfo", {}).get("info_data", {})
+    again = f"`sudo ip link set {name} down`, then {up_command(name)}"
+    rows = []
+    bitrate = data.get("bittiming", {}).get("bitrate")
+    if bitrate is not None:
+        good = abs(bitrate / CAN_BAUD_RATE - 1.0) < 1e-3
+        why = "not one frame gets through, and every node reports errors"
+        rows.append(judged(good, name, "bit rate", str(bitrate), str(CAN_BAUD_RATE), again, why))
+    if "state" in data:
+        rows.append(_state(name, str(data["state"]), data.get("berr_counter", {}), again))
+    if "LISTEN-ONLY" in data.get("ctrlmode", ()):
+        fix = f"`sudo ip link set {name} down`, then with `listen-only off`"
+        rows.append(wrong(name, "mode", "listen-only", "normal", fix, "nothing can be sent"))
+    if data.get("restart_ms") == 0:
+        why = "after bus-off, as after a short, it stays down"
+        rows.append(warning(name, "restart-ms", "0: off", "100", again, why))
+    length = link.get("txqlen")
+    if length is not None:
+        low, high = QUEUE
+        found, wanted = f"{length} frames", f"{low} to {high}"
+        fix = f"{FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`"
+        why = "too short: it overflows at arming; too long: a plugged-in drive gets old frames"
+        good = low <= length <= high
+        rows.append(advised(good, name, "send queue", found, wanted, fix, why))
+    # in one-shot mode the controller itself drops a frame that nobody acknowledges
+    return rows if "ONE-SHOT" in data.get("ctrlmode", ()) else rows + _restart_rows(root, name)
+
+
+def _restart_rows(root: Path, name: str) -> list[Finding]:
+    """Judge whether the joint services, or else this process, may restart an interface."""
+    services = [path.parent for path in root.glob("proc/[0-9]*/cmdline") if _is_service(path)]
+    allowed = [_may_restart(folder) for folder in services or [root / "proc/self"]]
+    if None in allowed:
+        return []
+    fix = "run them by the unit of `xrl hosts`, or grant CAP_NET_ADMIN (docs/drives.md)"
+    why = "a dozen frames stay in the queue through a power cut, and reach the drive after it"
+    found = "allowed" if all(allowed) else "not allowed"
+    what = "restart by the services"
+    return [advised(all(allowed), name, what, found, "allowed", fix, why)]
+
+
+def _is_service(cmdline: Path) -> bool:
+    try:
+        return b"services.joint" in cmdline.read_bytes()
+    except OSError:
+        return False
+
+
+def _may_restart(process: Path) -> bool | None:
+    """Return True if a process has CAP_NET_ADMIN; None: it is gone, or this is no Linux."""
+    try:
+        status = (process / "status").read_text(encoding="ascii")
+        capabilities = status.split("CapEff:")[1].split()[0]
+        return bool(int(capabilities, 16) >> _CAP_NET_ADMIN & 1)
+    except (OSError, IndexError, ValueError):
+        return None
+
+
+def _state(name: str, state: str, errors: Mapping[str, Any], again: str) -> Finding:
+    counted = f" (errors sent {errors.get('tx', 0)}, received {errors.get('rx', 0)})"
+    found = state.lower() + (counted if any(errors.values()) else "")
+    if state in _OFF:
+        return wrong(name, "controller", found, _WELL.lower(), again, "it takes no part in the bus")
+    wires = "120 ohm at both ends and nowhere else, ground wired along, one bit rate, short stubs"
+    why = "frames are resent and arrive late, or the bus goes off"
+    return advised(state == _WELL, name, "controller", found, _WELL.lower(), wires, why)
+
+
+def _flags(root: Path, name: str) -> int | None:
+    try:
+        return int((root / "sys/class/net" / name / "flags").read_text(encoding="utf-8"), 16)
+    except (OSError, ValueError):
+        return None
+
+
+def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
+    """Check the robot file; that it can be read at all is known by now."""
+    count = len(robot.assumed)
+    found = f"{count} values assumed" if count else "all values measured"
+    if count and process_table.is_simulated(robot):
+        assumed = ok(FILE, "assumed", f"{found}; the drives are emulated by them")
+    elif count:
+        fix = f"measure {', '.join(robot.assumed)}; then remove them from `assumed`"
+        assumed = warning(FILE, "assumed", found, "none", fix)
+    else:
+        assumed = ok(FILE, "assumed", found, "none")
+    rows = [ok(FILE, "read", str(path)), assumed]
+    if robot.law.split == "certified":
+        stale = gain_schedule.why_stale(robot)
+        fix = f"`xrl gains --config {shlex.quote(str(path))}`"
+        rows.append(judged(not stale, FILE, "gain schedule", stale or "fits", "fits", fix))
+    return rows
+
+
+def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
+    """Return the services that listen on their endpoints, whoever started them."""
+    here = security.services_here(robot)
+    return tuple(
+        service
+        for service in robot.services
+        if process_table.is_listening(expand(security.endpoint_here(robot, service, here), run_dir))
+    )
+
+
+def joint_services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
+    """Return which of these have drives."""
+    return tuple(service for service in services_up(robot, run_dir) if service in MODULES)
+
+
+def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> list[Finding]:
+    """Check that the endpoints of the bus are free, or the fleet's."""
+    what = "endpoints"
+    if fleet_is_up:
+        up = services_up(robot, run_dir)
+        found = f"{len(up)} of {len(robot.services)} listen"
+        silent = [module for module in MODULES if module not in up]
+        if len(silent) in (0, len(MODULES)):
+            return [ok("bus", what, found, "the fleet's")]
+        fix = f"`xrl status` says why {', '.join(silent)} is not there"
+        return [wrong("bus", what, found, "all six modules", fix)]
+    here = security.services_here(robot)
+    listeners = [
+        ListenPoint(service, f"bus.endpoints.{service}", expand(endpoint, run_dir))
+        for service in robot.bus.endpoints
+        for endpoint in security.listening(robot, service, here)
+        if not process_table.is_elsewhere(expand(endpoint, run_dir))
+    ]
+    try:
+        process_table.check_free(listeners)
+    except FleetError as error:
+        return [wrong("bus", what, str(error), "free", "`xrl down`, or another --run-dir")]
+    return [ok("bus", what, f"{len(listeners)} free", "free")]
+
+
+def security_rows(robot: RobotConfig) -> list[Finding]:
+    """Check `bus.security`, and under `mtls` each certificate that this host holds."""
+    mode = robot.bus.security.mode
+    if mode == "open":
+        fix = 'mode = "mtls", or "local" for one host (docs/security.md)'
+        why = "anyone who reaches a port commands the robot"
+        return [warning("bus", "security", mode, "mtls or local", fix, why)]
+    if mode == "local":
+        return [ok("bus", "security", mode, "only this user may link")]
+    try:
+        return [_key_row(row) for row in inspect_keys(keys_folder(robot), robot)]
+    except XrlError as error:
+        return [wrong("bus", "keys", str(error), "this host's own", "`xrl keys pack`")]
+
+
+def _key_row(row: KeyRow) -> Finding:
+    what, wanted = f"key of {row.name}", "valid"
+    if row.wrong:
+        return wrong("bus", what, row.wrong, wanted, "`xrl keys check`", "no link")
+    if row.warning:
+        why = "then no new links; existing links stay"
+        return warning("bus", what, row.warning, wanted, "`xrl keys renew`", why)
+    return ok("bus", what, f"from {row.begins} until {row.expires}", wanted)

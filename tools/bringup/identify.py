@@ -1,0 +1,304 @@
+"""`xrl drive identify`: friction and reflected inertia, from small sines of a hanging leg. Pure.
+
+The drive's own loop follows sines of a few frequencies, one after the other. Where q moves steadily
+its Fourier series gives rate and acceleration without a filter's lag, and
+
+    tau = I q'' + d q' + c sign(q') + k (q - q_0) + tau_0
+
+is linear in inertia I, viscous friction d, dry friction c, gravity's stiffness k and tau_0; two
+frequencies tell I and k apart. I holds rotor and leg: what hangs on the joint is taken off by the
+masses of the robot file, and so is known to a few percent of itself only. At an ankle that is a
+foot, at a knee or hip it is fifty times the rotor.
+
+A drive holds a target for a period, so its torque is a saw tooth. What counts is its mean about a
+sample: half of the old target's torque and half of the new one's, if the new one came at once
+(lockstep), and more of the old one's the later it comes (over CAN some 1 ms).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from shared.arrays import Array
+from shared.bus.messages import Pair
+from shared.config.robot_config import RobotConfig
+from tools.bringup.hanging_leg import HEAVY, HangingJoint
+from tools.bringup.motion import MotionPlan, Sample
+
+TONES: Final = ((0.4, 5), (1.0, 8), (2.0, 12))
+"""Hz and cycles of each tone; the first cycle and the last swell and fade, and are not used."""
+HEAVY_TONES: Final = ((0.2, 5), (0.5, 8))
+AMPLITUDE_MAX: Final = 0.06
+"""rad; the lowest tone, where nothing else limits it."""
+TORQUE_SHARE: Final = 0.4
+"""Fraction of the torque limit that a tone may need for inertia and gravity."""
+K_P: Final = (400.0, 3000.0)
+"""N m/rad, for light joints and heavy ones: soft, since a sample's time error shows as k_p times
+itself in the viscous friction."""
+K_D: Final = (8.0, 35.0)
+"""N m s/rad"""
+PER_INERTIA: Final = (1600.0, 50.0)
+"""k_p and k_d of a joint by its inertia: 40 rad/s."""
+AFTER: Final = 0.25
+"""Share of the new target's torque: as if it came 0.5 ms after the sample."""
+TIME_SD: Final = 5e-4
+"""s; how well that is known."""
+YIELDS: Final = 0.05
+"""Share of an inertia that is uncertain: leg and hoist, on the joint's other side, give way."""
+DRY_SD: Final = 0.04
+"""N m; cogging and play show as dry friction of this size."""
+MASS_SD: Final = 0.03
+"""Fraction of the leg's inertia in the robot file."""
+HALF_WIDTH: Final = 1.96
+"""Standard deviations on either side: 95 %."""
+HARMONICS: Final = 9
+MOVING: Final = 0.3
+"""Fraction of a tone's fastest rate; slower samples, where a joint sticks, are not used."""
+
+
+class Tone(NamedTuple):
+    """One sine, which swells in its first cycle and fades in its last."""
+
+    frequency_hz: float
+    amplitude: float
+    """rad"""
+    cycles: int
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes, s."""
+        return self.cycles / self.frequency_hz
+
+    def offset(self, t_s: float) -> tuple[float, float]:
+        """Return the sine, rad, and its rate, rad/s, at a time since its begin."""
+        omega = 2.0 * math.pi * self.frequency_hz
+        inside = min(1.0, t_s * self.frequency_hz, (self.duration_s - t_s) * self.frequency_hz)
+        sign = 1.0 if t_s < 0.5 * self.duration_s else -1.0
+        swell = 0.5 - 0.5 * math.cos(math.pi * inside)
+        rising = 0.0
+        if inside < 1.0:
+            rising = sign * 0.5 * math.pi * self.frequency_hz * math.sin(math.pi * inside)
+        sine, cosine = math.sin(omega * t_s), math.cos(omega * t_s)
+        return (
+            self.amplitude * swell * sine,
+            self.amplitude * (rising * sine + swell * omega * cosine),
+        )
+
+
+class Tones(NamedTuple):
+    """Tones one after the other (`tools.bringup.motion.AxisCourse`)."""
+
+    tones: tuple[Tone, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of all tones, s."""
+        return sum(tone.duration_s for tone in self.tones)
+
+    @property
+    def span(self) -> Pair:
+        """Lowest and highest offset, rad."""
+        most = max(tone.amplitude for tone in self.tones)
+        return -most, most
+
+    @property
+    def rate_max(self) -> float:
+        """Fastest rate that it asks for, rad/s."""
+        return max(2.0 * math.pi * tone.frequency_hz * tone.amplitude for tone in self.tones)
+
+    def at(self, t_s: float) -> Pair:
+        """Return offset, rad, and rate, rad/s."""
+        for begin_s, tone in self.begins():
+            if begin_s <= t_s < begin_s + tone.duration_s:
+                return tone.offset(t_s - begin_s)
+        return 0.0, 0.0
+
+    def begins(self) -> list[tuple[float, Tone]]:
+        """Return when each tone begins, s."""
+        found, at = [], 0.0
+        for tone in self.tones:
+            found.append((at, tone))
+            at += tone.duration_s
+        return found
+
+
+SinePlan = MotionPlan[Tones]
+
+
+class JointFit(NamedTuple):
+    """What the sines show; each a value and its standard deviation."""
+
+    inertia: tuple[float, float]
+    """Rotor and leg, kg m^2."""
+    viscous: tuple[float, float]
+    """N m s/rad"""
+    dry: tuple[float, float]
+    """N m"""
+    stiffness: tuple[float, float]
+    """Gravity's, N m/rad."""
+
+
+def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> SinePlan:
+    """Return sines that need a part of a torque, N m, of a joint led inside its limits first.
+
+    What holds the leg at its bias comes on top.
+    """
+    inertia, gravity = joint.inertia + armature, joint.gravity
+    tones = []
+    for hertz, cycles in HEAVY_TONES if inertia > HEAVY else TONES:
+        needed = abs(inertia * (2.0 * math.pi * hertz) ** 2 - gravity)
+        most = TORQUE_SHARE * torque / max(needed, gravity, 1e-9)
+        tones.append(Tone(hertz, float(min(AMPLITUDE_MAX, most)), cycles))
+    k_p = min(max(PER_INERTIA[0] * inertia, K_P[0]), K_P[1])
+    k_d = min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1])
+    # alike for both axes: both motors' own loops then do all of it
+    soft = ((k_p, k_p), (k_d, k_d))
+    return SinePlan(axis, Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
+
+
+def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
+    """Return what steady samples of a whole motion show; None if there are too few."""
+    parts = []
+    for along_s, tone in plan.course.begins():
+        begin_s = plan.rest_s + along_s
+        period = 1.0 / tone.frequency_hz
+        first, last = begin_s + period, begin_s + tone.duration_s - period
+        rows = [s for s in samples if first <= s.t_s < last]
+        if len(rows) < 20 * (tone.cycles - 2):
+            return None
+        parts.append(_steady(rows, begin_s, tone, plan.axis))
+    regressors, tau, cycle, weight = map(np.concatenate, zip(*parts, strict=True))
+    weighted = regressors * weight[:, None]
+    H = np.linalg.inv(weighted.T @ regressors)
+    x = H @ (weighted.T @ tau)
+    left = tau - regressors @ x
+    scores = np.array([weighted[cycle == k].T @ left[cycle == k] for k in np.unique(cycle)])
+    covariance = H @ scores.T @ scores @ H
+    inertia_sd, viscous_sd, dry_sd, stiffness_sd = np.sqrt(np.diag(covariance)[:4]).tolist()
+    assert plan.own_gains is not None  # noqa: S101 - `plan_for` gives them
+    (k_p, _), (k_d, _) = plan.own_gains
+    inertia, viscous, dry, stiffness = x[:4].tolist()
+    inertia_sd = math.hypot(inertia_sd, k_d * TIME_SD, YIELDS * inertia)
+    viscous_sd = math.hypot(viscous_sd, k_p * TIME_SD)
+    dry_sd = math.hypot(dry_sd, DRY_SD)
+    return JointFit(
+        inertia=(inertia, inertia_sd),
+        viscous=(viscous, viscous_sd),
+        dry=(dry, dry_sd),
+        stiffness=(stiffness, stiffness_sd),
+    )
+
+
+def _steady(
+    samples: Sequence[Sample], begin_s: float, tone: Tone, axis: int
+) -> tuple[Array, Array, Array, Array]:
+    """Return regressors (n, 5), torque (n,), cycle and weight of a tone's steady part.
+
+    A sample weighs as the way that it stands for: cogging slows a joint where it opposes, and to
+    count by time would take it for friction.
+    """
+    t = np.array([s.t_s - begin_s for s in samples])
+    q = np.array([s.q[axis] for s in samples])
+    before, after = (np.array([row[axis] for row in rows]) for rows in zip(
+        *((s.tau_before, s.tau) for s in samples), strict=True
+    ))  # fmt: skip
+    tau = before + AFTER * (after - before)
+    omega = 2.0 * math.pi * tone.frequency_hz
+    k = omega * np.arange(1, HARMONICS + 1)
+    cosine, sine = np.cos(np.outer(t, k)), np.sin(np.outer(t, k))
+    basis = np.hstack([np.ones((len(t), 1)), t[:, None], cosine, sine])
+    a, *_ = np.linalg.lstsq(basis, q, rcond=None)
+    a_cos, a_sin = a[2 : 2 + HARMONICS], a[2 + HARMONICS :]
+    v = sine @ (-k * a_cos) + cosine @ (k * a_sin)
+    acceleration = cosine @ (-k * k * a_cos) + sine @ (-k * k * a_sin)
+    smooth = basis @ a
+    rows = np.stack([acceleration, v, np.sign(v), smooth, np.ones(len(t))], axis=1)
+    cycle = np.floor(t * tone.frequency_hz) + 1000.0 * tone.frequency_hz
+    moving = np.abs(v) > MOVING * np.max(np.abs(v))
+    way = np.abs(np.gradient(q)) / np.mean(np.abs(v)) / np.mean(np.diff(t))
+    return rows[moving], tau[moving], cycle[moving], way[moving]
+
+
+class Verdict(StrEnum):
+    """What an estimate says of the robot file's value."""
+
+    CHANGE = "change"
+    """It lies outside the interval."""
+    AGREES = "agrees"
+    """It lies inside."""
+    MEASURED = "measured"
+    """The file has no such value."""
+    UNKNOWN = "not shown"
+    """The interval is too wide to say anything."""
+
+
+class Estimate(NamedTuple):
+    """One number of a joint."""
+
+    what: str
+    unit: str
+    file: float | None
+    """Value of the robot file; None if it has none."""
+    value: float
+    half_width: float
+    """Half the width of the 95 % interval."""
+    verdict: Verdict
+
+    @property
+    def digits(self) -> int:
+        """Decimals worth printing: a tenth of the interval."""
+        return max(0, 1 - math.floor(math.log10(max(self.half_width, 1e-9))))
+
+    def describes(self, truth: float) -> bool:
+        """Return True if a value lies within the interval."""
+        return abs(truth - self.value) <= self.half_width
+
+
+class JointResult(NamedTuple):
+    """What the sines of one joint showed."""
+
+    joint: str
+    fit: JointFit
+    leg_inertia: float
+    """Inertia of what hangs on it by the robot file, without its rotor, kg m^2."""
+
+    @property
+    def rotor(self) -> tuple[float, float]:
+        """Reflected inertia of the rotors and its standard deviation, kg m^2."""
+        total, sd = self.fit.inertia
+        return total - self.leg_inertia, math.hypot(sd, MASS_SD * self.leg_inertia)
+
+
+def estimates_of(results: Sequence[JointResult], robot: RobotConfig) -> list[Estimate]:
+    """Return what the sines say; the last row is the rotors' inertia, one for all joints.
+
+    It is not shown if its interval is wider than half of the robot file's value.
+    """
+    armature, rows = robot.joint.armature, []
+    for joint, fit, leg_inertia in results:
+        inertia = fit.inertia[0], math.hypot(fit.inertia[1], MASS_SD * leg_inertia)
+        rows += [
+            _estimate(f"dry friction {joint}", "N m", fit.dry),
+            _estimate(f"viscous friction {joint}", "N m s/rad", fit.viscous),
+            _estimate(f"inertia {joint}", "kg m^2", inertia, leg_inertia + armature),
+        ]
+    rotors = [result.rotor for result in results]
+    weight = sum(1.0 / sd**2 for _, sd in rotors)
+    mean = sum(value / sd**2 for value, sd in rotors) / weight
+    sd = max(weight**-0.5, YIELDS * armature)
+    last = _estimate("reflected inertia", "kg m^2", (mean, sd), armature)
+    known = HALF_WIDTH * sd < 0.5 * armature
+    return [*rows, last if known else last._replace(verdict=Verdict.UNKNOWN)]
+
+
+def _estimate(what: str, unit: str, of: tuple[float, float], file: float | None = None) -> Estimate:
+    value, half_width = of[0], HALF_WIDTH * of[1]
+    verdict = Verdict.MEASURED
+    if file is not None:
+        verdict = Verdict.AGREES if abs(value - file) <= half_width else Verdict.CHANGE
+    return Estimate(what, unit, file, value, half_width, verdict)

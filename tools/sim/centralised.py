@@ -1,0 +1,167 @@
+"""A baseline to compare with: the planner computes every torque, the joint services none.
+
+It runs in virtual time only. No service imports it and no robot file names it: `xrl sim --control`
+and `xrl study latency --control` select it by name. The planner's law is the shipped one. The
+planner also computes the joint services' part,
+
+    tau = D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled
+
+with the states that it has, as one torque for each joint. The modules pass it to the drives
+unchanged until the next one comes. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from services.joint import pd_law
+from services.joint.differential import limit_differential, motor_torque
+from services.joint.drive_manager import ArmingInhibit, DriveAction, DriveCommand, DriveManager
+from services.joint.drivers.base import DriveReading
+from services.joint.neighbours import UNKNOWN, NeighbourView
+from services.planner.planner import Planner
+from services.planner.watch.engagement_fsm import Engagement
+from shared.bus.messages import (
+    DriveStatus,
+    JointCommand,
+    JointState,
+    Mode,
+    PlannerMode,
+    PlannerStatus,
+)
+from shared.clock import NS_PER_MS
+from shared.config.gain_schedule import believing
+from shared.config.robot_config import RobotConfig
+from shared.robot.trip_table import untripped
+from tools.sim.lockstep import Lockstep
+
+
+class LeadsOn(Engagement):
+    """Engages as shipped, and then leads with any states: no tier below it could hold."""
+
+    def advance(
+        self,
+        now_ns: int,
+        fresh: list[bool],
+        ready: list[bool],
+        modes: list[int],
+        inhibit: PlannerMode | None = None,
+    ) -> bool:
+        """Take the modules' news, as `Engagement.advance`."""
+        if self.mode is PlannerMode.LEADING:
+            return False
+        return super().advance(now_ns, fresh, ready, modes, inhibit)
+
+
+class CentralPlanner(Planner):
+    """The shipped planner, whose commands are whole torques."""
+
+    def __init__(self, config: RobotConfig, session: int) -> None:
+        """Take the robot and the session, as the shipped planner does."""
+        super().__init__(config, session)
+        self.state.engagement = LeadsOn()
+
+    def tick(self, now_ns: int) -> list[JointCommand]:
+        """Run the law; return six commands, `tau_ff` of which is all of a joint's torque."""
+        commands = super().tick(now_ns)
+        states: Sequence[JointState] = [state for state in self.state.states if state is not None]
+        return [_whole(*pair) for pair in zip(commands, states, strict=True)] if commands else []
+
+    def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
+        """Return inputs and decisions of the last tick; no margin, because no part stands alone."""
+        status = super().status(now_ns, tick_us)
+        return msgspec.structs.replace(status, margin=0.0, margin_onboard=0.0)
+
+
+def _whole(command: JointCommand, state: JointState) -> JointCommand:
+    """Return the command with all that it asks for, in a state, as one torque."""
+    return msgspec.structs.replace(
+        command,
+        v_ref=pd_law.ZERO,
+        tau_ff=pd_law.torque(pd_law.extrapolate(command, 0.0), state.q, state.v),
+        dtau_ff=pd_law.ZERO,
+        tau_coupled=pd_law.ZERO,
+        k_p=pd_law.ZERO,
+        k_d=pd_law.ZERO,
+        margin=0.0,
+        margin_onboard=0.0,
+    )
+
+
+class PassThrough(DriveManager):
+    """A joint module that passes torques on.
+
+    It comes up as the shipped one, from the hoist through HOLD into TRACK. From the end of that
+    blend on it has no law: the newest torque that has come goes to the drive until the next
+    one, however old. The torque limiter keeps only the torque diamond. After an e-stop, or with a
+    lost drive, the shipped module's law is in force again.
+    """
+
+    def __init__(self, config: RobotConfig, name: str) -> None:
+        """Take the robot and the module's name."""
+        super().__init__(config, name)
+        self._blend_ns = config.joint_service.blend_ms * NS_PER_MS
+        self._tau_module_max = config.joint.tau_module_max
+        self._tracks_since_ns: int | None = None
+
+    def step(
+        self,
+        now_ns: int,
+        reading: DriveReading | None,
+        command: JointCommand | None,
+        estop: bool,
+        near: NeighbourView = UNKNOWN,  # noqa: ARG002 - nothing here sinks
+    ) -> DriveAction:
+        """Run one cycle; arguments as for the shipped module."""
+        problem = estop or (reading is not None and reading.status is not DriveStatus.ARMED)
+        if problem or not self._passes(now_ns):
+            step = super().step(now_ns, reading, command, estop)
+            if step.event is not None:
+                tracks = step.event.mode_after == Mode.TRACK
+                self._tracks_since_ns = now_ns if tracks else None
+            return step
+        controller = self.state.controller
+        controller.cycle += 1
+        if reading is not None:
+            controller.estimate.take(reading, armed=True)
+        if command is not None and all(map(math.isfinite, command.tau_ff)):
+            controller.failsafe.command = command  # its age goes into the states
+            controller.tau = limit_differential(command.tau_ff, self._tau_module_max)
+        torque = motor_torque(controller.tau, self._gear_ratio)
+        return DriveAction(None, DriveCommand.TORQUE, torque, None, ArmingInhibit.NONE)
+
+    def _passes(self, now_ns: int) -> bool:
+        since_ns = self._tracks_since_ns
+        return since_ns is not None and now_ns - since_ns >= self._blend_ns
+
+
+def torques_only(config: RobotConfig) -> RobotConfig:
+    """Return the robot with drives that take torques and hold nothing by themselves.
+
+    Its joint services accept any command, because this planner sends gains of zero.
+    """
+    service = msgspec.structs.replace(config.joint_service, loop="service")
+    return msgspec.structs.replace(untripped(believing(config)), joint_service=service)
+
+
+class CentralisedLockstep(Lockstep):
+    """A whole fleet in virtual time, each torque computed by the planner."""
+
+    planner_type = CentralPlanner
+    module_type = PassThrough
+
+    def __init__(self, config: RobotConfig, *args: Any, **how: Any) -> None:
+        """Put the robot on the hoist; arguments as for `Lockstep`."""
+        super().__init__(torques_only(config), *args, **how)
+
+
+SHIPPED: Final = "distributed"
+CONTROLS: Final[Mapping[str, type[Lockstep]]] = {
+    SHIPPED: Lockstep,
+    "centralised": CentralisedLockstep,
+}
+"""By who computes the torques."""
