@@ -13,7 +13,7 @@ import numpy as np
 from shared.arrays import Array
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tools.judge.reports.events import Event, Events
+from tools.judge.reports.events import Events, TimelineEvent
 from tools.judge.reports.panels import COLOURS, GAP_S, Bar, Line, Panel, panels_of
 from tools.judge.reports.run_data import RunData, Span
 from tools.judge.reports.summary import Judge, MessageLosses, inputs, verdict_and_facts
@@ -232,7 +232,7 @@ def _tools(run: RunData) -> str:
     )
 
 
-def _listed(events: Sequence[Event]) -> str:
+def _listed(events: Sequence[TimelineEvent]) -> str:
     rows = "".join(
         f'<li class="{row.kind}"><button type="button" data-t="{row.t:.4f}" '
         f'data-before="{BEFORE_S.get(row.kind, 0.5):g}"><time>{row.t:.3f} s</time> '
