@@ -70,7 +70,7 @@ def nodes_of(kind: type[N], *folders: str) -> Iterator[tuple[str, N]]:
 VENDORS = {
     "getpass": ["shared/places.py"],
     "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
-    "rosbags": ["services/ros2_gateway/ros_types.py", "tools/export/ros2_bag.py"],
+    "rosbags": ["services/ros2_gateway/conversions.py", "tools/export/ros2_bag.py"],
     "shtab": ["tools/verbs/completion.py"],
     "mujoco": [
         "services/simulator/physics/world.py",
@@ -408,6 +408,10 @@ def test_no_controller_can_see_the_plant() -> None:
         assert ".simulation" not in SOURCES[file], file
 
 
+EXITS = ("sys.exit", "os._exit", "SystemExit")
+CODES = (1, 2, 3, 70)
+
+
 def bare_exit_codes(tree: ast.AST) -> list[int]:
     """Return the lines at which a function of type int, or an exit, gives a code without its name.
 
@@ -416,42 +420,26 @@ def bare_exit_codes(tree: ast.AST) -> list[int]:
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef) and ast.unparse(node.returns or node) == "int":
-            found += _bare_codes_of(node)
+            inside = list(ast.walk(node))
+            values = [each.value for each in inside if isinstance(each, ast.Return) and each.value]
+            names = {value.id for value in values if isinstance(value, ast.Name)}
+            assigned = (each for each in inside if isinstance(each, ast.Assign))
+            values += [a.value for a in assigned if names & set(map(ast.unparse, a.targets))]
+            found += [value.lineno for value in values if is_bare_code(value)]
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in EXITS:
-            found += [node.lineno for value in node.args if _is_bare_code(value, texts=True)]
+            found += [node.lineno for value in node.args if is_bare_code(value, texts=True)]
     return found
 
 
-EXITS = ("sys.exit", "os._exit", "SystemExit")
-CODES = (1, 2, 3, 70)
-
-
-def _bare_codes_of(function: ast.FunctionDef) -> list[int]:
-    nodes = list(ast.walk(function))
-    values = [node.value for node in nodes if isinstance(node, ast.Return) and node.value]
-    names = {value.id for value in values if isinstance(value, ast.Name)}
-    values += [
-        node.value
-        for node in nodes
-        if isinstance(node, ast.Assign)
-        and any(isinstance(target, ast.Name) and target.id in names for target in node.targets)
-    ]
-    return [value.lineno for value in values if _is_bare_code(value)]
-
-
-def _is_bare_code(value: ast.expr, *, texts: bool = False) -> bool:
+def is_bare_code(value: ast.expr, *, texts: bool = False) -> bool:
     match value:
-        case ast.Constant(value=str()):
-            return texts
         case ast.Constant(value=constant):
-            return constant in CODES
+            return texts if isinstance(constant, str) else constant in CODES
         case ast.IfExp():
-            return any(_is_bare_code(one, texts=texts) for one in (value.body, value.orelse))
+            return any(is_bare_code(one, texts=texts) for one in (value.body, value.orelse))
         case ast.Call(func=ast.Name(id="int"), args=[truth]):
-            called = ast.unparse(truth.func) if isinstance(truth, ast.Call) else ""
-            is_not = isinstance(truth, ast.UnaryOp) and isinstance(truth.op, ast.Not)
-            is_truth = isinstance(truth, ast.Compare | ast.BoolOp) or is_not
-            return is_truth or called in ("all", "any", "bool")
+            is_truth = isinstance(truth, ast.Compare | ast.BoolOp)
+            return is_truth or ast.unparse(truth).startswith(("not ", "all(", "any(", "bool("))
     return False
 
 

@@ -22,7 +22,7 @@ from tests.lockstep.runs import Run, kill, led_to, modes_of, push, run, still
 from tests.planner.states import with_law
 from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
-from tools.live.descent import LIGHT_FRACTION, Ask, Descent, Phase
+from tools.live.descent import LIGHT_FRACTION, Ask, Descent, DescentPhase
 from tools.sim.lockstep import Lockstep, begin_standing
 
 AT_S = 0.3
@@ -130,7 +130,7 @@ HOIST_M = 0.003
 def hang(fleet: Descending, row: SimTruth) -> None:
     """Once it is down, have a hoist lift it until its feet are in the air."""
     hoist = fleet.world.outside.hoist
-    if fleet.descent.phase is Phase.RESTING and hoist.share == 0.0:
+    if fleet.descent.phase is DescentPhase.RESTING and hoist.share == 0.0:
         hoist.position = np.array(row.torso)
         hoist.share, hoist.releasing = 1.0, False
     elif hoist.share > 0.0:

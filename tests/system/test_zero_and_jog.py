@@ -6,9 +6,7 @@ import json
 import os
 import signal
 import subprocess
-import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -62,54 +60,62 @@ def eventually_look(robot: RobotConfig, run_dir: Path, module: str, *, zeroed: b
         drive.close()
 
 
-@pytest.fixture(scope="module")
-def simulator() -> Iterator[Path]:
-    """Return the run directory of a simulator, which two tests share."""
-    with (
-        tempfile.TemporaryDirectory(dir="/tmp", prefix="xrl-t-") as folder,
-        started(Path(folder) / "r", "simulator") as up,
-    ):
-        yield up.run.path
-
-
 def test_emulated_drives_are_zeroed_by_a_protractor_and_by_the_stand(
-    simulator: Path, robot: RobotConfig
+    run_dir: Path, robot: RobotConfig
 ) -> None:
-    run_dir = simulator
-    with heard(robot, run_dir) as ear:  # until it hangs still
-        height = ear.world(after_s=drive_access.SETTLE_S).torso[2]
-    true = {m: eventually_look(robot, run_dir, m, zeroed=True).q for m in MODULES}
-    lose_power(robot, run_dir, MODULE)
-    eventually_look(robot, run_dir, MODULE, zeroed=False)
-    unasked = xrl("drive", "zero", MODULE, "--at", "0,-0.9", run_dir=run_dir)
-    assert (unasked.returncode, "unzeroed" in unasked.stdout) == (2, True)
-    assert "--yes" in unasked.stderr
-    assert not eventually_look(robot, run_dir, MODULE, zeroed=False).zeroed
-    done = xrl("drive", "zero", MODULE, "--at", "0.01,-0.9", "--yes", run_dir=run_dir)
-    assert done.returncode == 0, done.stdout + done.stderr
-    seen = eventually_look(robot, run_dir, MODULE, zeroed=True)
-    assert seen.q == pytest.approx((0.01, -0.9), abs=zeroing.WITHIN)
-    done = xrl("drive", "zero", "--all", "--standing", str(height), "--yes", run_dir=run_dir)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count(" zeroed") >= len(MODULES)
-    for module in MODULES:
-        seen = eventually_look(robot, run_dir, module, zeroed=True)
-        assert seen.q == pytest.approx(true[module], abs=0.01), "so it was from the start"
+    with started(run_dir, "simulator"):
+        with heard(robot, run_dir) as ear:  # until it hangs still
+            height = ear.world(after_s=drive_access.SETTLE_S).torso[2]
+        true = {m: eventually_look(robot, run_dir, m, zeroed=True).q for m in MODULES}
+        lose_power(robot, run_dir, MODULE)
+        eventually_look(robot, run_dir, MODULE, zeroed=False)
+        unasked = xrl("drive", "zero", MODULE, "--at", "0,-0.9", run_dir=run_dir)
+        assert unasked.returncode == 2
+        assert "unzeroed" in unasked.stdout
+        assert "--yes" in unasked.stderr
+        assert not eventually_look(robot, run_dir, MODULE, zeroed=False).zeroed
+        done = xrl("drive", "zero", MODULE, "--at", "0.01,-0.9", "--yes", run_dir=run_dir)
+        assert done.returncode == 0, done.stdout + done.stderr
+        seen = eventually_look(robot, run_dir, MODULE, zeroed=True)
+        assert seen.q == pytest.approx((0.01, -0.9), abs=zeroing.WITHIN)
+        done = xrl("drive", "zero", "--all", "--standing", str(height), "--yes", run_dir=run_dir)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert done.stdout.count(" zeroed") >= len(MODULES)
+        for module in MODULES:
+            seen = eventually_look(robot, run_dir, module, zeroed=True)
+            assert seen.q == pytest.approx(true[module], abs=0.01), "so it was from the start"
 
 
-def test_a_small_limit_stops_it_and_the_doctor_then_finds_the_drive_as_it_was(
-    simulator: Path,
+def test_beside_its_joint_service_a_module_is_zeroed_only_while_that_is_disarmed(
+    run_dir: Path, robot: RobotConfig
 ) -> None:
-    """Its limits too: `drive configure --apply` would restart the board for them, zero and all."""
-    run_dir = simulator
-    weak = xrl("drive", "jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
-    assert weak.returncode == 3, weak.stdout + weak.stderr
-    assert "torque limit of 4 N m" in weak.stdout
-    assert "both axes are idle" in weak.stdout
-    report = json.loads(xrl("doctor", "--json", run_dir=run_dir).stdout)
-    rows = [row for group in report["groups"].values() for row in group]
-    assert [row for row in rows if row["verdict"] == "wrong"] == []
-    assert sum(row["what"] == "settings" for row in rows) == len(MODULES)
+    order = ("drive", "zero", MODULE, "--at", "0.03,-1.0", "--yes")
+    with started(run_dir, "simulator", MODULE) as fleet, heard(robot, run_dir) as ear:
+        ear.wait_for({MODULE: Mode.HOLD})
+        held = xrl(*order, run_dir=run_dir)
+        assert held.returncode == 2
+        assert "holds it (HOLD)" in held.stderr
+        lose_power(robot, run_dir, MODULE)
+        ear.wait_for({MODULE: Mode.FAULT})
+        faulty = xrl(*order, run_dir=run_dir)
+        assert faulty.returncode == 2
+        assert f"xrl kill {MODULE}" in faulty.stderr
+        fleet.kill(MODULE)
+        ear.wait_for({MODULE: Mode.DISARMED})
+        eventually_look(robot, run_dir, MODULE, zeroed=False)
+        done = xrl(*order, run_dir=run_dir)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "arms the drive as soon as it is zeroed" in " ".join(done.stdout.split())
+        ear.wait_for({MODULE: Mode.HOLD})
+
+
+def test_a_leg_of_the_emulated_robot_follows_and_nothing_is_left_behind(run_dir: Path) -> None:
+    done = xrl("drive", "jog", *LEG, "--cycles", "1", run_dir=run_dir)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "FOLLOWED" in done.stdout
+    assert "both axes are idle" in done.stdout
+    assert not procfs.fleet_pids(run_dir)
+    assert not run_dir.exists()
 
 
 def test_on_the_emulated_robot_an_interrupt_and_a_service_stop_it(
@@ -143,33 +149,16 @@ def test_on_the_emulated_robot_an_interrupt_and_a_service_stop_it(
             assert why in refused.stderr
 
 
-def test_beside_its_joint_service_a_module_is_zeroed_only_while_that_is_disarmed(
-    run_dir: Path, robot: RobotConfig
+def test_a_small_limit_stops_it_and_the_doctor_then_finds_the_drive_as_it_was(
+    run_dir: Path,
 ) -> None:
-    order = ("drive", "zero", MODULE, "--at", "0.03,-1.0", "--yes")
-    with started(run_dir, "simulator", MODULE) as fleet, heard(robot, run_dir) as ear:
-        ear.wait_for({MODULE: Mode.HOLD})
-        held = xrl(*order, run_dir=run_dir)
-        assert held.returncode == 2
-        assert "holds it (HOLD)" in held.stderr
-        lose_power(robot, run_dir, MODULE)
-        ear.wait_for({MODULE: Mode.FAULT})
-        faulty = xrl(*order, run_dir=run_dir)
-        assert faulty.returncode == 2
-        assert f"xrl kill {MODULE}" in faulty.stderr
-        fleet.kill(MODULE)
-        ear.wait_for({MODULE: Mode.DISARMED})
-        eventually_look(robot, run_dir, MODULE, zeroed=False)
-        done = xrl(*order, run_dir=run_dir)
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert "arms the drive as soon as it is zeroed" in " ".join(done.stdout.split())
-        ear.wait_for({MODULE: Mode.HOLD})
-
-
-def test_a_leg_of_the_emulated_robot_follows_and_nothing_is_left_behind(run_dir: Path) -> None:
-    done = xrl("drive", "jog", *LEG, "--cycles", "1", run_dir=run_dir)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "FOLLOWED" in done.stdout
-    assert "both axes are idle" in done.stdout
-    assert not procfs.fleet_pids(run_dir)
-    assert not run_dir.exists()
+    """Its limits too: `drive configure --apply` would restart the board for them, zero and all."""
+    with started(run_dir, "simulator"):
+        weak = xrl("drive", "jog", MODULE, "--torque-limit", "4", "--yes", run_dir=run_dir)
+        assert weak.returncode == 3, weak.stdout + weak.stderr
+        assert "torque limit of 4 N m" in weak.stdout
+        assert "both axes are idle" in weak.stdout
+        report = json.loads(xrl("doctor", "--json", run_dir=run_dir).stdout)
+    rows = [row for group in report["groups"].values() for row in group]
+    assert [row for row in rows if row["verdict"] == "wrong"] == []
+    assert sum(row["what"] == "settings" for row in rows) == len(MODULES)

@@ -44,7 +44,7 @@ LOOK_EVERY_S: Final = 0.1
 SHOWN_WORDS: Final = 9
 
 
-class Part:
+class Check:
     """A command, its output and its outcome."""
 
     def __init__(self, command: tuple[str, ...], *, beside: bool = False) -> None:
@@ -114,14 +114,14 @@ def main(argv: Sequence[str]) -> int:
         if "pytest.mark.system" in file.read_text("utf-8")
     ]
     alone = (PYTEST + tuple(argv),) if argv else (LIVE, (*WAITING, *marked))
-    parts: list[Part] = []
+    parts: list[Check] = []
     try:
         for command in () if argv else PATIENT:
-            parts.append(Part(command, beside=True))
+            parts.append(Check(command, beside=True))
             print(f"== beside the others, shown after them: {parts[-1].name}", flush=True)
         beside = list(parts)
         for command in (*CHECKS, *alone):
-            parts.append(Part(command))
+            parts.append(Check(command))
             parts[-1].follow()
         for part in beside:
             part.follow()
@@ -155,7 +155,7 @@ def _stop(running: list[subprocess.Popen[bytes]]) -> None:
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def _summarise(done: list[Part], took_s: float) -> int:
+def _summarise(done: list[Check], took_s: float) -> int:
     """Print what failed, then the last line; return the exit code."""
     failures = [line for part in done for line in part.failures]
     for line in failures:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
+from rich.live import Live
 from rich.text import Text
 
 from shared.bus.messages import OperatorIntent, PlannerMode, PlannerStatus, Vector4
+from shared.bus.session import Latest, Publisher
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
+from shared.places import user_name
 
 REPEAT_S: Final = 0.02
 HEARD_S: Final = 3.0
@@ -23,25 +27,15 @@ SHIFT_UNITS: Final = (("x", "m"), ("y", "m"), ("roll", "rad"), ("yaw", "rad"))
 Stop = Callable[[], bool]
 
 
-class IntentClient(Protocol):
-    """The way to the planner."""
-
-    def put(self, message: OperatorIntent) -> bool:
-        """Send without waiting."""
+def asker(verb: str) -> str:
+    """Return the requester's name for a verb, as `OperatorIntent.source` has it."""
+    return f"xrl {verb} by {user_name()} ({os.getpid()})"
 
 
-class Statuses(Protocol):
-    """The way back."""
-
-    def take(self) -> PlannerStatus | None:
-        """Return the newest status since the last call, or None."""
-
-
-class Shown(Protocol):
-    """Where it is shown how much is given."""
-
-    def update(self, renderable: Text) -> None:
-        """Show a line in place of the last."""
+def other_asker(status: PlannerStatus | None, own: str = "") -> str:
+    """Return who else requests something of the planner; "" if only a scenario or nobody does."""
+    by = "" if status is None else status.requested_by
+    return "" if by in (SCENARIO, own) else by
 
 
 def refuse_beyond_limits(robot: RobotConfig, assist: float, shift: Vector4) -> None:
@@ -62,11 +56,11 @@ def refuse_beyond_limits(robot: RobotConfig, assist: float, shift: Vector4) -> N
 
 
 def ask(
-    intents: IntentClient,
-    statuses: Statuses,
+    intents: Publisher[OperatorIntent],
+    statuses: Latest[PlannerStatus],
     request: OperatorIntent,
     stop: Stop,
-    shown: Shown,
+    shown: Live,
     *,
     for_s: float | None = None,
 ) -> float:
@@ -87,8 +81,8 @@ def ask(
     status = _first(statuses, stop)
     if status is None:
         return 0.0
-    if status.requested_by not in ("", SCENARIO):
-        raise FleetError(f"{status.requested_by} asks already; end that first")
+    if other := other_asker(status):
+        raise FleetError(f"{other} asks already; end that first")
     start = received_at = time.monotonic()
     while not stop() and (for_s is None or time.monotonic() - start < for_s):
         now = time.monotonic()
@@ -128,7 +122,7 @@ def describe(request: OperatorIntent, status: PlannerStatus) -> str:
     return words + " - Ctrl-C ends it"
 
 
-def _first(statuses: Statuses, stop: Stop) -> PlannerStatus | None:
+def _first(statuses: Latest[PlannerStatus], stop: Stop) -> PlannerStatus | None:
     deadline = time.monotonic() + HEARD_S
     while not stop():
         status = statuses.take()

@@ -71,7 +71,7 @@ class Ask(Enum):
     """Nothing bears weight: the drives may go limp."""
 
 
-class Phase(Enum):
+class DescentPhase(Enum):
     """How far it is."""
 
     LOOKING = "looking whether it bears weight"
@@ -126,7 +126,7 @@ class Descent:
         self._load, self._wait_s = _LegLoad(robot), wait_s
         self._stop = robot.joint_service.damp_knee_stop
         self._fade_s = robot.joint_service.damp_fade_s
-        self.phase = Phase.LOOKING
+        self.phase = DescentPhase.LOOKING
         self._since_s: float | None = None
         self._light_s: float | None = None
         self._moved_s = 0.0
@@ -166,16 +166,16 @@ class Descent:
         if len(known) == len(MODULES):
             self._knee = min(known[knee].q[1] for knee in _KNEES)
         match self.phase:
-            case Phase.LOOKING:
+            case DescentPhase.LOOKING:
                 return self._look(now_s, states, status)
-            case Phase.LOWERING:
+            case DescentPhase.LOWERING:
                 return self._lower(now_s, known, status)
-            case Phase.SETTLING:
+            case DescentPhase.SETTLING:
                 return self._settle(now_s, known)
-            case Phase.RESTING:
+            case DescentPhase.RESTING:
                 return self._rest(now_s)
 
-    def _enter(self, phase: Phase, now_s: float) -> None:
+    def _enter(self, phase: DescentPhase, now_s: float) -> None:
         self.phase, self._since_s = phase, now_s
         self._moved_s = self._led_s = now_s
         self._height = self._rested = math.inf
@@ -205,7 +205,9 @@ class Descent:
             )
         damped = all(state is not None and state.mode == Mode.DAMP for state in states)
         may_lead = status is not None and status.mode in _MAY_LEAD
-        self._enter(Phase.LOWERING if may_lead and not damped else Phase.SETTLING, now_s)
+        self._enter(
+            DescentPhase.LOWERING if may_lead and not damped else DescentPhase.SETTLING, now_s
+        )
         return Ask.NOTHING
 
     def _lower(
@@ -215,7 +217,7 @@ class Descent:
             self._led_s = now_s
         elif now_s - self._led_s > (HEARD_S if status is None else PATIENCE_S):
             if status is None:  # dead, or cut off: DAMP needs no planner
-                self._enter(Phase.SETTLING, now_s)
+                self._enter(DescentPhase.SETTLING, now_s)
                 return Ask.STOP
             why = status.why or name_of(PlannerMode, status.mode)
             raise FleetError(
@@ -228,7 +230,7 @@ class Descent:
         if height < self._height - STALLED_M or self._led_s != now_s:
             self._height, self._moved_s = min(height, self._height), now_s
         if self._knee < self._stop + KNEE_CLOSE and now_s - self._moved_s > REST_S:
-            self._enter(Phase.SETTLING, now_s)
+            self._enter(DescentPhase.SETTLING, now_s)
             return Ask.STOP
         if now_s - self._moved_s > STALLED_S:
             raise FleetError(
@@ -246,7 +248,7 @@ class Descent:
         if len(known) < len(MODULES) or abs(self._knee - self._rested) > REST_RAD:
             self._moved_s, self._rested = now_s, self._knee
         if self._for_s(now_s) > self._fade_s and now_s - self._moved_s > REST_S:
-            self._enter(Phase.RESTING, now_s)
+            self._enter(DescentPhase.RESTING, now_s)
         elif self._for_s(now_s) > SETTLE_S:
             raise FleetError(f"it does not come to rest within {SETTLE_S:g} s; {WAYS}")
         return Ask.NOTHING

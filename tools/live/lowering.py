@@ -15,8 +15,8 @@ from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import BusError, FleetError
 from shared.joints import MODULES
-from tools.fleet.led_planner import asker, other_asker
-from tools.live.descent import WAYS, Ask, Descent, Phase
+from tools.live.assist_request import asker, other_asker
+from tools.live.descent import WAYS, Ask, Descent, DescentPhase
 
 LOOK_S: Final = 0.02
 """An intent that is not repeated ends within `assist.stale_ms`."""
@@ -81,14 +81,14 @@ class _Lowering:
                 status = newest[-1] if isinstance(newest[-1], PlannerStatus) else None
                 ask = descent.step(now_s, states, status)
                 self._ask(ask, descent.phase, status)
-                pause_s = WAITING_TELL_S if descent.phase is Phase.RESTING else TELL_S
+                pause_s = WAITING_TELL_S if descent.phase is DescentPhase.RESTING else TELL_S
                 if descent.phase is not phase or (
-                    now_s - told_s > pause_s and phase is not Phase.LOOKING
+                    now_s - told_s > pause_s and phase is not DescentPhase.LOOKING
                 ):
                     told_s, phase = now_s, descent.phase
-                    waits = phase is Phase.RESTING and not self._simulated
+                    waits = phase is DescentPhase.RESTING and not self._simulated
                     self._tell(descent.words + (HINT if waits else ""))
-                if ask is Ask.IDLE or (self._simulated and descent.phase is Phase.RESTING):
+                if ask is Ask.IDLE or (self._simulated and descent.phase is DescentPhase.RESTING):
                     return
                 time.sleep(LOOK_S)
         except KeyboardInterrupt:
@@ -96,16 +96,16 @@ class _Lowering:
                 "interrupted: its services go on, and "
                 + (
                     "it stands where it is"
-                    if descent.phase in (Phase.LOOKING, Phase.LOWERING)
+                    if descent.phase in (DescentPhase.LOOKING, DescentPhase.LOWERING)
                     else "it sinks to its lowest pose in DAMP, where it holds"
                 )
             )
             raise
         finally:
-            if descent.phase is not Phase.LOOKING:
+            if descent.phase is not DescentPhase.LOOKING:
                 self._put_intent(sit=False)
 
-    def _ask(self, ask: Ask, phase: Phase, status: PlannerStatus | None) -> None:
+    def _ask(self, ask: Ask, phase: DescentPhase, status: PlannerStatus | None) -> None:
         """Repeat what is asked for; a simulated person keeps the hand off until it is down."""
         if ask in (Ask.SIT, Ask.STOP) and not self._seq:
             require_operator(self._robot, "down")
@@ -115,7 +115,7 @@ class _Lowering:
             self._assist_n = status.assist_requested_n if status is not None else 0.0
         if ask is Ask.STOP:
             self._stops.put(Estop(t_ns=now_ns(), seq=self._seq, source=self._source))
-        if phase is not Phase.LOOKING:
+        if phase is not DescentPhase.LOOKING:
             self._put_intent(sit=True)
 
     def _put_intent(self, *, sit: bool) -> None:

@@ -22,10 +22,9 @@ from shared.exceptions import FleetError, HungUpError
 from shared.process import StopFlag
 from tools.flags import Arg, Duration, Number, RunDirFlags, numbers, option, parsed
 from tools.fleet.emergency_stop import BusStop, refuse_going, request_here
-from tools.fleet.led_planner import asker, other_asker
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
-from tools.live.assist_request import ask, refuse_beyond_limits
+from tools.live.assist_request import ask, asker, other_asker, refuse_beyond_limits
 from tools.pads.gamepad import BUTTONS, Gamepad, find_pad
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
