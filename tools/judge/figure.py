@@ -15,7 +15,7 @@ import numpy as np
 from shared.atomic_file import replace_file
 from shared.extras import late
 from tools.judge import verdict
-from tools.judge.reports.events import Event, Events
+from tools.judge.reports.events import Events, TimelineEvent
 from tools.judge.reports.panels import COLOURS, GAP_S, Line, Panel, panels_of
 from tools.judge.reports.run_data import RunData
 from tools.judge.verdict import ShownStall, Summary, fell
@@ -159,7 +159,7 @@ def _bars(axis: Any, panel: Panel) -> None:
     _legend(axis, handles)
 
 
-def _events(axes: Any, events: Sequence[Event], length_s: float) -> None:
+def _events(axes: Any, events: Sequence[TimelineEvent], length_s: float) -> None:
     """Mark events in every panel, with their names above the first."""
     ends = [-np.inf] * LABEL_ROWS
     for event in events:

@@ -61,7 +61,7 @@ class FoxgloveServer:
 
     def __init__(self, source: Source, port: int = FOXGLOVE_PORT) -> None:
         self._source = source
-        context = foxglove.Context()
+        context = self._context = foxglove.Context()  # its channels close with it
         self._listener = _Lookers()
         name = f"xrl {source.robot.name}, {source.title}"
         try:

@@ -26,6 +26,7 @@ from tools.fleet import stalls
 from tools.fleet.stalls import APART_NS, Disturbance, Stall, StallWatch, disturbances, stalls_of
 from tools.judge import verdict, verdict_table
 from tools.judge.standing import LIMITS
+from tools.judge.verdict import ShownStall
 from tools.live.scenario_runner import STARTING, ScenarioRunner, describe_machine
 from tools.logs.run_log import RunLog, RunPart
 
@@ -176,16 +177,16 @@ def test_figures_leave_out_what_a_stall_made_of_a_run_and_a_line_tells_it(log: R
     (force,) = (row for row in LIMITS if row.key == "operator_peak_n")
     assert verdict_table.mark(force, without) == "over"
     assert verdict_table.mark(force, apart) == "ok"
-    (row,) = apart["stalls"]
-    assert row["modules_held"] == 6
-    assert row["said"].endswith(" s: the machine stalled for 80 ms: all six held")
-    words = shown(apart | {"stopped": []})
-    assert row["said"] in words
+    (row,) = apart.stalls
+    assert row.modules_held == 6
+    assert row.said.endswith(" s: the machine stalled for 80 ms: all six held")
+    words = shown(apart)
+    assert row.said in words
     assert "leave out what a stall made of the run" in words
 
 
 def test_stalls_without_effect_share_a_line() -> None:
-    quiet = [{"said": "", "modules_held": 0, "lasted_ms": length} for length in (21.0, 34.0)]
+    quiet = [ShownStall(0.0, length, 0.0, 0, "") for length in (21.0, 34.0)]
     words = shown(judged(stalls=quiet))
     assert "Stalls of the machine without consequence: 2, at most 34 ms\n" in words
 

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import struct
 import threading
+from pathlib import Path
 from typing import Any
 
 import aiohttp
+import pytest
+from foxglove import Channel, Context, open_mcap
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
 
+from shared.bus import codec, topics
 from shared.config.robot_config import RobotConfig
+from shared.mcap_log import schema
+from shared.robot.frames import rotated
+from tests.messages import sample
 from tests.tools.view.test_view_server import Recorded
-from tools.view.foxglove_server import FoxgloveServer
+from tools.judge.reports.robot_pose import FORCE_MIN_N
+from tools.view.foxglove_server import FoxgloveServer, arrows, rotation_to
 
 PROTOCOL = "foxglove.sdk.v1"
 FRAMES = 5
@@ -75,3 +87,23 @@ def test_a_client_finds_the_robots_frames_and_is_served_only_while_it_looks(
     finally:
         ended.set()
         serving.join()
+
+
+@given(st.tuples(*[st.floats(-10.0, 10.0)] * 3).filter(lambda v: math.hypot(*v) > 1e-3))
+def test_an_arrow_points_along_its_force(force: tuple[float, float, float]) -> None:
+    length = math.hypot(*force)
+    tip = rotated(rotation_to(force), (length, 0.0, 0.0))
+    assert tip == pytest.approx(force, abs=1e-6)
+    assert len(arrows(force, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 1.0))) == (length >= FORCE_MIN_N)
+
+
+def test_foxgloves_own_library_accepts_every_schema(tmp_path: Path) -> None:
+    context = Context()
+    path = tmp_path / "theirs.mcap"
+    with open_mcap(path, context=context):
+        for topic in topics.TOPICS:
+            text = json.loads(schema.encoded(topic.type))
+            channel = Channel(topic.name, schema=text, context=context)
+            channel.log(json.loads(codec.encode(sample(topic.type))))
+    with path.open("rb") as file:
+        assert make_reader(file).get_summary() is not None

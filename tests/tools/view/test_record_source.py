@@ -15,6 +15,7 @@ from tests.shared.mcap_log.runs import recorded_in_parts
 from tests.tools.judge.reports.runs import changed
 from tools.fleet.stalls import Stall
 from tools.logs.run_log import RunLog, read_run, robot_of
+from tools.view.frame import Newest
 from tools.view.record import RecordSource
 from tools.view.source import COURSE_FRAMES, Order
 
@@ -85,11 +86,10 @@ def test_the_files_of_a_split_run_are_shown_as_one(
         assert shown.frame(t_s) == source.frame(t_s)
 
 
-def test_before_all_modules_were_heard_there_is_no_frame(source: RecordSource) -> None:
+def test_before_all_modules_were_heard_there_is_no_frame_and_behind_the_end_they_are_silent(
+    source: RecordSource,
+) -> None:
     assert source.frame(-1e6) is None
-
-
-def test_behind_the_end_the_modules_are_silent(source: RecordSource) -> None:
     frame = source.frame(source.model().end_s + 10.0)
     assert frame is not None
     assert frame.modes == (-1,) * 6
@@ -110,14 +110,21 @@ def test_a_record_takes_no_order(source: RecordSource) -> None:
     assert source.carry_out(Order(order="kill", service="planner")) == "kill is not possible here"
 
 
-def test_without_a_simulated_world_the_pose_is_what_the_legs_know(log: RunLog) -> None:
-    """The planner's own kinematics: within a centimetre of the truth."""
+def test_without_a_simulated_world_pose_and_soles_are_what_the_legs_know(log: RunLog) -> None:
+    """By the planner's own kinematics; the robot stands still before the scenario begins."""
     with_truth = RecordSource(log, robot_of(log))
     without = RecordSource(log, robot_of(log))
     without._keys = [row for row in without._keys if row[0] is not topics.SIM_TRUTH]
-    t_s = with_truth.model().end_s - 0.2
-    known, true = without.frame(t_s), with_truth.frame(t_s)
+    known, true = without.frame(-0.2), with_truth.frame(-0.2)
     assert known is not None
     assert true is not None
-    assert not known.is_true
-    assert max(abs(a - b) for a, b in zip(known.torso, true.torso, strict=True)) < 0.01
+    assert (known.is_true, known.soles_estimated) == (False, True)
+    assert (true.is_true, true.soles_estimated) == (True, False)
+    assert known.torso == pytest.approx(true.torso, abs=0.01)
+    for estimated, measured in zip(known.soles, true.soles, strict=True):
+        assert estimated.force[2] == pytest.approx(measured.force[2], rel=0.04)
+        assert estimated.cop == pytest.approx(measured.cop, abs=0.005)
+
+
+def test_straight_legs_say_nothing_of_the_soles(log: RunLog) -> None:
+    assert Newest(robot_of(log)).estimated_soles([0.0] * 12, [1.0] * 12) == ()

@@ -72,18 +72,6 @@ async def drag(
         await page.mouse("move", x + dx * part / 10, y + dy * part / 10, shift=shift)
 
 
-def test_a_shove_shows_and_ends_with_the_hand(lockstep: LockstepSource) -> None:
-    async def work(page: Page, address: str) -> None:
-        await page.open(address)
-        await page.until(MODES, lambda text: text.count("TRACK") == 6, 60.0)
-        await drag(page, 640.0, 200.0, 80.0, 0.0, shift=True)
-        await until(lambda: any(force_of(lockstep)))
-        await page.mouse("up", 720.0, 200.0, shift=True)
-        await until(lambda: not any(force_of(lockstep)))
-
-    with_page(lockstep, work)
-
-
 def force_of(source: LockstepSource) -> tuple[float, float, float]:
     frame = source.frame(0.0)
     return frame.push if frame is not None else (0.0, 0.0, 0.0)
@@ -164,6 +152,10 @@ def test_a_person_leads_pushes_kills_and_stops_it_with_the_mouse(
         await drag(page, 640.0, 260.0, 0.0, -60.0)
         await page.until(HEIGHT, lambda height: height > low + 0.05)
         await page.mouse("up", 640.0, 200.0)
+        await drag(page, 640.0, 200.0, 80.0, 0.0, shift=True)
+        await until(lambda: any(force_of(lockstep)))
+        await page.mouse("up", 720.0, 200.0, shift=True)
+        await until(lambda: not any(force_of(lockstep)))
         pushed = "document.getElementById('plots').querySelectorAll('canvas').length"
         assert await page.value(pushed) == 8
         await page.value(button("kill"))

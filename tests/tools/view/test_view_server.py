@@ -207,32 +207,23 @@ async def test_without_the_token_or_an_origin_there_is_nothing(bench: Bench) -> 
 
 
 @served
-async def test_a_source_listens_only_while_a_page_is_open(bench: Bench) -> None:
+async def test_a_source_listens_while_a_page_is_open_and_each_page_has_its_own_place(
+    bench: Bench,
+) -> None:
     assert bench.source.connected == []
     one, two = await bench.page(), await bench.page()
-    for page in (one, two):
-        assert (await message_with(page, "model"))["robot"] == "xrl"
-        await message_with(page, "frame")
-    await one.close()
-    await two.send_json({"seek_s": 2.0})
-    await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
-    assert False not in bench.source.connected
-    await two.close()
-    await until(lambda: not bench.source.connected[-1])
-
-
-@served
-async def test_each_page_has_a_place_in_the_record_of_its_own(bench: Bench) -> None:
-    one, two = await bench.page(), await bench.page()
+    assert (await message_with(one, "model"))["robot"] == "xrl"
     await one.send_json({"seek_s": 7.5})
     await message_with(one, "frame", lambda frame: frame["t_s"] == 7.5)
     assert (await message_with(two, "frame"))["t_s"] == 0.0
-    await two.send_json({"play": True, "rate": 20.0})
-    await message_with(two, "frame", lambda frame: frame["t_s"] == 10.0)
     await one.send_json({"seek_s": -99.0})
     await message_with(one, "frame", lambda frame: frame["t_s"] == 0.0)
     await one.close()
+    await two.send_json({"play": True, "rate": 20.0})
+    await message_with(two, "frame", lambda frame: frame["t_s"] == 10.0)
+    assert False not in bench.source.connected
     await two.close()
+    await until(lambda: not bench.source.connected[-1])
 
 
 @pytest.mark.parametrize(
@@ -255,23 +246,18 @@ async def test_what_is_not_understood_is_told_and_the_page_stays_open(
 
 
 @served
-async def test_orders_go_to_the_source_and_its_refusal_to_the_page(bench: Bench) -> None:
+async def test_orders_go_to_the_source_and_an_emergency_stop_waits_for_none(bench: Bench) -> None:
     page = await bench.page()
     await page.send_json({"order": "push", "force": [1.0, 2.0, 3.0]})
     await page.send_json({"order": "dance"})
     assert await message_with(page, "error") == "not here"
-    await page.close()
-    assert bench.source.orders_taken[0] == Order(order="push", force=(1.0, 2.0, 3.0))
-
-
-@served
-async def test_an_emergency_stop_waits_for_no_other_order(bench: Bench) -> None:
-    page = await bench.page()
     await page.send_json({"order": "cut", "service": "slow"})
     await page.send_json({"order": "estop"})
-    await until(lambda: len(bench.source.orders_taken) == 2)
+    await until(lambda: len(bench.source.orders_taken) == 4)
     await page.close()
-    assert [order.order for order in bench.source.orders_taken] == ["estop", "cut"]
+    push, *others = bench.source.orders_taken
+    assert push == Order(order="push", force=(1.0, 2.0, 3.0))
+    assert [order.order for order in others] == ["dance", "estop", "cut"]
 
 
 @served
@@ -299,22 +285,18 @@ async def test_a_message_that_is_too_long_ends_the_page_and_no_other(bench: Benc
 
 
 @served
-async def test_so_many_pages_and_no_more(bench: Bench) -> None:
-    pages = [await bench.page() for _ in range(CLIENTS_MAX)]
+async def test_a_page_too_many_is_refused_and_one_that_does_not_drain_holds_up_no_other(
+    bench: Bench,
+) -> None:
+    writer = await silent_page(bench.server)
+    pages = [await bench.page() for _ in range(CLIENTS_MAX - 1)]
     with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
         await bench.page()
     assert refused.value.status == 503
+    await pages[0].send_json({"play": True, "rate": 5.0})
+    await message_with(pages[0], "frame", lambda frame: frame["t_s"] == 10.0)
     for page in pages:
         await page.close()
-
-
-@served
-async def test_a_page_that_does_not_drain_holds_up_no_other(bench: Bench) -> None:
-    writer = await silent_page(bench.server)
-    page = await bench.page()
-    await page.send_json({"play": True, "rate": 5.0})
-    await message_with(page, "frame", lambda frame: frame["t_s"] == 10.0)
-    await page.close()
     writer.close()
 
 
@@ -369,27 +351,17 @@ def test_whatever_a_page_asks_for_it_stays_within_the_record(
         assert -3.0 <= place <= 20.0
 
 
-def test_it_begins_where_the_scenario_does_and_waits() -> None:
+def test_a_cursor_plays_at_its_rate_stops_at_the_end_and_begins_anew() -> None:
     cursor = TimelineCursor(-3.0, 20.0)
-    assert (cursor.at(5.0), cursor.playing) == (0.0, False)
-
-
-def test_it_plays_at_its_rate_stops_at_the_end_and_begins_anew() -> None:
-    cursor = TimelineCursor(0.0, 10.0)
+    assert (cursor.at(5.0), cursor.playing) == (0.0, False), "it waits at the scenario's begin"
     cursor.control(100.0, True, None, 2.0)
     assert cursor.at(101.5) == 3.0
     cursor.control(101.5, None, None, 0.5)
     assert cursor.at(103.5) == 4.0, "a new rate makes no jump"
-    assert cursor.at(1000.0) == 10.0
+    assert cursor.at(1000.0) == 20.0
     assert not cursor.playing
-    cursor.control(1000.0, True, None, None)
-    assert cursor.at(1001.0) == 0.5
-
-
-def test_rates_have_limits_and_a_record_without_length_never_plays() -> None:
-    cursor = TimelineCursor(0.0, 100.0)
-    cursor.control(0.0, True, None, 1e9)
-    assert cursor.at(1.0) == RATES[1]
+    cursor.control(1000.0, True, None, 1e9)
+    assert cursor.at(1000.5) == -3.0 + 0.5 * RATES[1]
     nothing = TimelineCursor(0.0, 0.0)
     nothing.control(0.0, True, None, None)
     assert not nothing.playing

@@ -41,7 +41,7 @@ END_S: Final = 0.1
 _NORMAL_MODES: Final = (PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.LEADING)
 
 
-class Event(NamedTuple):
+class TimelineEvent(NamedTuple):
     """One event of a run."""
 
     t: float
@@ -57,8 +57,9 @@ class Events:
     """The events of a run, whose parts are taken one after the other."""
 
     def __init__(self) -> None:
-        self._found: list[Event] = []
-        self._last: dict[tuple[_Watched, str], Any] = {}
+        self._found: list[TimelineEvent] = []
+        self._last: dict[tuple[_Watched, str], tuple[Any, str]] = {}
+        """Newest message of each state and its words."""
         self._last_heard: dict[str, float] = {}
         self._silences: list[tuple[float, str, float]] = []
         self._violations: dict[tuple[str, str, Beyond], tuple[float, float]] = {}
@@ -77,7 +78,7 @@ class Events:
         for panel in panels:
             self._add_violations(run, panel)
 
-    def all(self, span: Span) -> list[Event]:
+    def all(self, span: Span) -> list[TimelineEvent]:
         """Return all events in the order of time."""
         found = [*self._found, *self._told_silences(), *self._told_violations()]
         found.sort(key=lambda row: row.t)
@@ -86,28 +87,28 @@ class Events:
             marked = [row for row in found if row.mark]
             others = [row for row in found if not row.mark][: max(0, ROWS_MAX - len(marked))]
             found = sorted(marked + others, key=lambda row: row.t)
-            found.append(Event(span.end, "note", f"about {left} more events are left out"))
+            found.append(TimelineEvent(span.end, "note", f"about {left} more events are left out"))
         return found
 
-    def _changes(self, run: RunData, watched: _Watched) -> Iterator[Event]:
+    def _changes(self, run: RunData, watched: _Watched) -> Iterator[TimelineEvent]:
         """Yield the changes of a state, also one across the edge of two parts."""
         changes: list[tuple[float, str, Any, Any]] = []
         for module in MODULES if watched.topic.per_module else ("",):
-            before = self._last.get((watched, module))
+            before, known = self._last.get((watched, module), (None, ""))
+            times = run.times(watched.topic, module)
             messages = run.log.messages(watched.topic, module)
-            for t, after in zip(run.times(watched.topic, module).tolist(), messages, strict=True):
-                if not run.inside(t):
-                    continue
-                if before is not None and watched.words(before) != watched.words(after):
-                    changes.append((t, module, before, after))
-                before = after
-            self._last[watched, module] = before
+            for t, is_in, after in zip(times, run.inside(times), messages, strict=True):
+                words = watched.words(after) if is_in else known
+                if before is not None and words != known:
+                    changes.append((float(t), module, before, after))
+                before, known = (after, words) if is_in else (before, known)
+            self._last[watched, module] = before, known
         changes.sort(key=lambda row: row[0])
         for group in _together(changes, lambda row: tuple(map(watched.words, row[2:]))):
             t, _, before, after = group[0]
             who = watched.who.format(_modules(module for _, module, _, _ in group))
             text = f"{who}: {watched.words(before)} to {watched.words(after)}"
-            yield Event(t, "bad" if watched.is_bad(before, after) else "note", text)
+            yield TimelineEvent(t, "bad" if watched.is_bad(before, after) else "note", text)
 
     def _add_silences(self, run: RunData) -> None:
         """Add the gaps in periodic topics, by the recorder's clock."""
@@ -128,18 +129,18 @@ class Events:
                 for index in np.flatnonzero(steps > max(GAP_S, 5.0 / topic.rate_hz))
             ]
 
-    def _told_silences(self) -> Iterator[Event]:
+    def _told_silences(self) -> Iterator[TimelineEvent]:
         for group in _together(sorted(self._silences), lambda _: None):
             names = ", ".join(_merged([name for _, name, _ in group]))
             longest = max(length for *_, length in group)
             most = "up to " if len(group) > 1 else ""
-            yield Event(group[0][0], "note", f"{names} silent for {most}{longest:.2f} s")
+            yield TimelineEvent(group[0][0], "note", f"{names} silent for {most}{longest:.2f} s")
 
     def _add_violations(self, run: RunData, panel: Panel) -> None:
         for line in panel.lines:
             steps = np.append(np.diff(line.t), 0.0)
             usual = float(np.median(steps[:-1])) if len(steps) > 1 else 0.0
-            for limit, where in line.beyond.items():
+            for limit, where in line.beyond:
                 beyond = where & run.inside(line.t)
                 if beyond.any():
                     key = panel.title, line.label, limit
@@ -148,7 +149,7 @@ class Events:
                     duration_s = float(np.minimum(steps, 5.0 * usual)[beyond].sum())
                     self._violations[key] = first_s, before_s + duration_s
 
-    def _told_violations(self) -> Iterator[Event]:
+    def _told_violations(self) -> Iterator[TimelineEvent]:
         """Yield the first violation of each limit; modules that pass it together in one row.
 
         The search for the cause of a fall begins at the earliest one.
@@ -163,30 +164,30 @@ class Events:
             labels = ", ".join(label for *_, label, _ in group)
             longest_s = max(duration_s for *_, duration_s in group)
             text = f"{title}, {labels}: {words} for the first time; {longest_s:.2f} s in total"
-            yield Event(first_s, "limit", text)
+            yield TimelineEvent(first_s, "limit", text)
 
 
-def events_of(run: RunData) -> list[Event]:
+def events_of(run: RunData) -> list[TimelineEvent]:
     """Return all events of a whole run in the order of time."""
     events = Events()
     events.add(run, panels_of(run))
     return events.all(run.span)
 
 
-def _run_events(run: RunData) -> Iterator[Event]:
+def _run_events(run: RunData) -> Iterator[TimelineEvent]:
     for event in run.log.messages(topics.RUN_EVENT):
-        yield Event(run.at(event.t_ns), *_told(event))
+        yield TimelineEvent(run.at(event.t_ns), *_told(event))
     last_s = -math.inf
     for stop in run.log.messages(topics.ESTOP):
         t = run.at(stop.t_ns)
         if t - last_s > 1.0:  # a stop is published repeatedly
-            yield Event(t, "estop", f"emergency stop by {stop.source}", "e-stop")
+            yield TimelineEvent(t, "estop", f"emergency stop by {stop.source}", "e-stop")
         last_s = t
     for request in run.log.messages(topics.HARNESS_TARE):
-        yield Event(run.at(request.t_ns), "note", f"tare requested by {request.source}")
+        yield TimelineEvent(run.at(request.t_ns), "note", f"tare requested by {request.source}")
     fallen = next((row for row in run.log.messages(topics.SIM_TRUTH) if row.fallen), None)
     if fallen is not None:
-        yield Event(run.at(fallen.t_ns), "fall", "the robot fell", "fell")
+        yield TimelineEvent(run.at(fallen.t_ns), "fall", "the robot fell", "fell")
 
 
 _RUN_EVENTS: Final[Mapping[int, tuple[str, str, str]]] = {
@@ -211,19 +212,19 @@ def _told(event: RunEvent) -> tuple[str, str, str]:
     return kind, text, mark
 
 
-def _network(run: RunData) -> Iterator[Event]:
+def _network(run: RunData) -> Iterator[TimelineEvent]:
     """Yield the begin and the end of each impairment, of all its directions together."""
     for row in impairments(run.log.messages(topics.LINK_EVENT)):
         begin_s, end_s = row.begin_s(run.zero_ns), row.end_s(run.zero_ns)
-        yield Event(begin_s, "network", f"network, {row.title}", row.title)
+        yield TimelineEvent(begin_s, "network", f"network, {row.title}", row.title)
         if end_s is None:
             continue
         text = f"network, {row.title} ends; {row.counts()}"
         mark = f"{row.link} ends" if end_s < run.span.end - END_S else ""
-        yield Event(end_s, "network" if mark else "note", text, mark)
+        yield TimelineEvent(end_s, "network" if mark else "note", text, mark)
 
 
-def _mode_changes(run: RunData) -> Iterator[Event]:
+def _mode_changes(run: RunData) -> Iterator[TimelineEvent]:
     changes: list[tuple[float, str, JointEvent]] = sorted(
         (run.at(event.t_ns), module, event)
         for module in MODULES
@@ -249,7 +250,9 @@ def _mode_changes(run: RunData) -> Iterator[Event]:
         if ages:
             text += f"; command {max(ages) / NS_PER_MS:.1f} ms old"
         bad = first.mode_after in (Mode.FAULT, Mode.DAMP)
-        yield Event(t, "bad" if bad else "note", f"{text}; torque step {max(steps):.2f} N m")
+        yield TimelineEvent(
+            t, "bad" if bad else "note", f"{text}; torque step {max(steps):.2f} N m"
+        )
 
 
 def _modules(found: Iterable[str]) -> str:

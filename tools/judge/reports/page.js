@@ -8,7 +8,6 @@ const MARK_COLOURS = {
   network: "--net", restart: "--good", push: "--muted",
 };
 const FONT = "11px system-ui, sans-serif", MARKS_ROOM = 44, BAR_HEIGHT = 18, PLOT_HEIGHT = 170;
-const NO_SELECTION = { left: 0, top: 0, width: 0, height: 0 };
 
 const view = { from: BEGIN, to: END, panels: [], style: null };
 const theme = (name) => view.style.getPropertyValue(name).trim();
@@ -18,29 +17,13 @@ function show(from, to) {
   const length = Math.min(END - BEGIN, Math.max(0.005, to - from));
   view.from = Math.min(END - length, Math.max(BEGIN, (from + to - length) / 2));
   view.to = view.from + length;
-  for (const { plot } of view.panels) plot.setSelect(NO_SELECTION, false);
-  redraw();
-}
-
-function redraw() {
   for (const panel of view.panels) panel.resize();
 }
 
-function zoom(factor) {
-  const t = (view.from + view.to) / 2, half = (view.to - view.from) / 2 * factor;
-  show(t - half, t + half);
-}
-
-function pan(fraction) {
-  const by = (view.to - view.from) * fraction;
-  show(view.from + by, view.to + by);
-}
-
-function make(tag, name, text = "") {
-  const node = document.createElement(tag);
-  node.className = name;
-  node.textContent = text;
-  return node;
+// Move the time shown by a fraction of its length, and make it longer or shorter.
+function move(fraction, factor = 1) {
+  const length = view.to - view.from, middle = view.from + (0.5 + fraction) * length;
+  show(middle - factor * length / 2, middle + factor * length / 2);
 }
 
 const fourDigits = (value) => String(Number(value.toPrecision(4)));
@@ -132,12 +115,11 @@ function paintBars(plot, rows) {
 class Panel {
   constructor(spec, isFirst, parent) {
     Object.assign(this, { spec, isFirst, hasBars: spec.rows.length > 0 });
-    const element = make("section", this.hasBars ? "panel bars" : "panel");
-    const top = make("div", "top");
-    top.append(make("h3", "", spec.title + (spec.unit ? `, ${spec.unit}` : "")));
-    top.append(make("span", "hint", spec.note));
-    this.stage = make("div", "stage");
-    element.append(top, this.stage);
+    const element = document.createElement("section"), { title, unit, note } = spec;
+    element.className = this.hasBars ? "panel bars" : "panel";
+    element.innerHTML = `<div class="top"><h3>${title}${unit ? `, ${unit}` : ""}</h3>
+      <span class="hint">${note}</span></div><div class="stage"></div>`;
+    this.stage = element.lastElementChild;
     parent.append(element);
     const times = Float64Array.from({ length: 2001 }, (_, n) => BEGIN + n * (END - BEGIN) / 2000);
     const columns = this.hasBars
@@ -222,6 +204,7 @@ class Panel {
 
   resize() {
     const { plot } = this, size = this.size();
+    plot.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
     plot.batch(() => {
       if (size.width !== plot.width) plot.setSize(size);
       plot.setScale("x", { min: view.from, max: view.to });
@@ -250,7 +233,7 @@ function barSeries([label, bars]) {
 
 function listenToPage() {
   const moves = {
-    left: () => pan(-0.5), right: () => pan(0.5), in: () => zoom(0.5), out: () => zoom(2),
+    left: () => move(-0.5), right: () => move(0.5), in: () => move(0, 0.5), out: () => move(0, 2),
     all: () => show(BEGIN, END),
   };
   for (const button of document.querySelectorAll("[data-do]")) {
@@ -264,11 +247,11 @@ function listenToPage() {
       rows.forEach((other) => other.setAttribute("aria-current", String(other === row)));
       if (!view.panels.length) return;
       const { plot } = view.panels[0];
-      plot.setCursor({ left: plot.valToPos(t, "x"), top: 0 });
+      plot.setCursor({ left: plot.valToPos(t, "x"), top: 0 }, true, true);
       view.panels[0].stage.scrollIntoView({ block: "nearest" });
     });
   }
-  const renew = () => { readTheme(); redraw(); };
+  const renew = () => { readTheme(); show(view.from, view.to); };
   window.addEventListener("resize", renew);
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", renew);
 }

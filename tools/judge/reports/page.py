@@ -13,9 +13,9 @@ import numpy as np
 from shared.arrays import Array
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
-from tools.judge.reports.events import Event, Events
+from tools.judge.reports.events import Events, TimelineEvent
 from tools.judge.reports.panels import COLOURS, GAP_S, Bar, Line, Panel, panels_of
-from tools.judge.reports.run_data import RunData, Span, TimeAxis
+from tools.judge.reports.run_data import RunData, Span
 from tools.judge.reports.summary import Judge, MessageLosses, inputs, verdict_and_facts
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
@@ -32,9 +32,8 @@ a plot shows every extreme, and a page of an hour has 2 MB."""
 BEFORE_S: Final = {"fall": 3.0}
 """A click on an event shows this time before it; else half a second."""
 HELP: Final = (
-    "Drag in a plot to zoom all plots; double-click to show the whole run. Ctrl and wheel zoom at "
-    "the cursor. The legends show the values at the cursor; click a name to hide or show its line. "
-    "Dotted red lines are limits."
+    "Drag in a plot to zoom all plots; double-click to show the whole run. The legends show the "
+    "values at the cursor; click a name to hide or show its line. Dotted red lines are limits."
 )
 POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
@@ -114,8 +113,8 @@ def with_gaps(t: Array, values: Array) -> tuple[Array, Array]:
 class Page:
     """The page of a run, whose parts are taken one after the other."""
 
-    def __init__(self, axis: TimeAxis | None = None) -> None:
-        self._axis = axis
+    def __init__(self, zero_ns: int | None = None, span: Span | None = None) -> None:
+        self._zero_ns, self._span = zero_ns, span
         self._about: RunData | None = None
         self._has_first = self._has_last = False
         self._panels: dict[str, _PanelData] = {}
@@ -125,7 +124,7 @@ class Page:
 
     def add(self, log: RunLog) -> None:
         """Add a run, or the next part of it."""
-        run = RunData(log, self._axis)
+        run = RunData(log, self._zero_ns, self._span)
         self._has_first |= log.is_first
         self._has_last |= log.is_last
         if self._about is None or (self._about.course is None and run.course is not None):
@@ -183,7 +182,7 @@ def render_parts(
     zero = zero_ns(index)
     offset_s = (index.span_ns[0] - zero) / NS_PER_S
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
-    page = Page(TimeAxis(zero, Span(begin_s + offset_s, end_s + offset_s)))
+    page = Page(zero, Span(begin_s + offset_s, end_s + offset_s))
     heard = False
     for log in parts_of(index, part, part_s=part_s, done=done):
         heard = heard or bool(log.keys())
@@ -233,7 +232,7 @@ def _tools(run: RunData) -> str:
     )
 
 
-def _listed(events: Sequence[Event]) -> str:
+def _listed(events: Sequence[TimelineEvent]) -> str:
     rows = "".join(
         f'<li class="{row.kind}"><button type="button" data-t="{row.t:.4f}" '
         f'data-before="{BEFORE_S.get(row.kind, 0.5):g}"><time>{row.t:.3f} s</time> '

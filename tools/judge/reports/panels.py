@@ -5,14 +5,15 @@ The report's page and `run.png` draw the same panels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from services.joint.trips import AT_LIMIT
 from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import Mode, PlannerMode, name_of
@@ -30,8 +31,6 @@ AGE_REACH: Final = 1.2
 """Top of the panel of ages, as a multiple of the oldest usable age: older commands are not used."""
 AGE_MAX_MS: Final = 50.0
 """Oldest usable age if the log does not tell its robot's."""
-AT_LIMIT: Final = 0.999
-"""Fraction of a module's torque limit from which the torque counts as limited."""
 TORQUE_DURATION_MIN_S: Final = 0.02
 """Shorter times at the torque limit, in total, are not reported."""
 COLOURS: Final[Mapping[str, str]] = {
@@ -55,9 +54,8 @@ class Beyond(NamedTuple):
     """A shorter time beyond it, in total, is not reported."""
 
 
-Beyonds = Mapping[Beyond, NDArray[np.bool_]]
+Beyonds = Sequence[tuple[Beyond, NDArray[np.bool_]]]
 """Where a line is beyond its limits."""
-WITHOUT_LIMIT: Final[Beyonds] = MappingProxyType({})
 
 
 class Line(NamedTuple):
@@ -71,7 +69,7 @@ class Line(NamedTuple):
     hidden: bool = False
     """True: not shown until the user switches it on in the legend."""
     dashed: bool = False
-    beyond: Beyonds = WITHOUT_LIMIT
+    beyond: Beyonds = ()
 
 
 class Level(NamedTuple):
@@ -112,7 +110,7 @@ def _body(run: RunData) -> Iterator[Panel]:
     simulated = bool(len(t))
 
     def both(
-        label: str, truth: Array, estimate: Array, colour: int, beyond: Beyonds = WITHOUT_LIMIT
+        label: str, truth: Array, estimate: Array, colour: int, beyond: Beyonds = ()
     ) -> list[Line]:
         """Return the simulated value and, hidden, the planner's estimate; or only the latter."""
         lines = [Line(label, t, truth, colour, beyond=beyond)] if simulated else []
@@ -150,14 +148,14 @@ def _body(run: RunData) -> Iterator[Panel]:
 
 
 def _hand(run: RunData) -> Panel:
-    """Return the operator's force, with what is carried and pushed."""
+    """Return the operator's force, with what is carried."""
     title, unit = "Operator's force", "N"
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     if not len(t):
         t, force = run.times(topics.WRENCH), run.wide(topics.WRENCH, "force", 3)
         lines = [Line(f"hand, {axis}", t, force[:, n], n) for n, axis in enumerate("xyz")]
         return Panel(title, unit, "By the harness sensor, torso axes.", lines=lines)
-    force, push = (run.wide(topics.SIM_TRUTH, name, 3) for name in ("operator_force", "push"))
+    force = run.wide(topics.SIM_TRUTH, "operator_force", 3)
     load, carried = run.columns(topics.SIM_TRUTH, "", "load_n", "harness_force_z")
     requested, assist = run.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
     judged = _Judged(run)
@@ -176,11 +174,6 @@ def _hand(run: RunData) -> Panel:
             Line("assist requested", t_p, requested, 6, dashed=True),
             Line("assist applied", t_p, assist, 7, hidden=True),
         ]
-    lines += [
-        Line(f"push, {axis}", t, push[:, number], 3 + number, hidden=True)
-        for number, axis in enumerate("xyz")
-        if push[:, number].any()
-    ]
     return Panel(title, unit, "World axes, on the torso.", lines=lines, levels=levels)
 
 
@@ -238,7 +231,7 @@ def _torques(run: RunData) -> Panel:
     for number, module in enumerate(MODULES):
         tau = np.abs(run.wide(topics.JOINT_STATE, "tau", 2, module)).sum(axis=1)
         limit = Beyond(f"at the limit of {most:g} N m", TORQUE_DURATION_MIN_S)
-        beyond = {limit: tau >= AT_LIMIT * most}
+        beyond = [(limit, tau >= AT_LIMIT * most)]
         t = run.times(topics.JOINT_STATE, module)
         lines.append(Line(module, t, tau, number, beyond=beyond))
     return Panel(
@@ -251,20 +244,20 @@ def _torques(run: RunData) -> Panel:
 
 def _certificate(run: RunData) -> Panel:
     """Return the stability margins of the active gains and the least allowed margins."""
-    t = run.times(topics.PLANNER_STATUS)
-    mode, *margins = run.columns(topics.PLANNER_STATUS, "", "mode", "margin", "margin_onboard")
-    levels, lines = [Level(0.0, "unstable", shown=True)], []
-    for number, (label, margin) in enumerate(zip(("services", "drives"), margins, strict=True)):
-        margin[_waits(run)] = np.nan
-        beyond = WITHOUT_LIMIT
-        if run.robot is not None:
-            certificate = run.robot.certificate
-            least = (certificate.margin_min, certificate.onboard_margin_min)[number]
-            levels.append(Level(least, f"least, {label}", shown=True))
-            is_led = mode != PlannerMode.MISPLACED
-            beyond = {Beyond(f"under {least:g}"): (margin < least) & is_led}
-        name = "joint services alone" if number == 0 else "drives alone"
+    t, levels, lines = run.times(topics.PLANNER_STATUS), [Level(0.0, "unstable", shown=True)], []
+    least = (math.nan, math.nan)
+    if run.robot is not None:
+        least = run.robot.certificate.margin_min, run.robot.certificate.onboard_margin_min
+    for number, (field, name) in enumerate(
+        (("margin", "joint services alone"), ("margin_onboard", "drives alone"))
+    ):
+        mode, margin = run.columns(topics.PLANNER_STATUS, "", "mode", field)
+        margin[_waits(run)] = math.nan
+        is_under = (margin < least[number]) & (mode != PlannerMode.MISPLACED)
+        beyond = [(Beyond(f"under {least[number]:g}"), is_under)]
         lines.append(Line(name, t, margin, number, beyond=beyond))
+        if math.isfinite(least[number]):
+            levels.append(Level(least[number], f"least, {name}", shown=True))
     return Panel(
         "Certificate margin",
         note="Stability without the planner: 1 is the required stiffness, at 0 the robot falls.",
@@ -291,12 +284,12 @@ class _Judged:
 
     def beyond(self, values: Array, led_key: str, held_key: str = "") -> Beyonds:
         """Return where values are beyond their limits of the verdict; an empty key: no limit."""
-        found = {}
+        found = []
         for key, mask, when in ((led_key, self._led, "led"), (held_key, self._held, "held")):
             if key:
                 row = BY_KEY[key]
                 limit = Beyond(f"over {row.limit:g} {row.unit} while {when}")
-                found[limit] = mask & (np.abs(values) > row.limit)
+                found.append((limit, mask & (np.abs(values) > row.limit)))
         return found
 
 

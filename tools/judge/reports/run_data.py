@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -25,18 +26,10 @@ class Span(NamedTuple):
     end: float
 
 
-class TimeAxis(NamedTuple):
-    """The time axis of a page."""
-
-    zero_ns: int
-    """Monotonic stamp of time 0."""
-    span: Span
-
-
 class RunData:
     """A log or a part of one, its time axis and its robot."""
 
-    def __init__(self, log: RunLog, axis: TimeAxis | None = None) -> None:
+    def __init__(self, log: RunLog, zero_ns: int | None = None, span: Span | None = None) -> None:
         self.log = log
         self.course: Course | None = None
         """Trajectory of the simulated world; None if the log has none or its scenario never
@@ -49,15 +42,13 @@ class RunData:
             self.without_course = str(error).replace(f"{log.path}: ", "")
         self.robot: RobotConfig | None = None
         """Configuration of the robot; None if the log holds none that this version can read."""
-        try:
+        with contextlib.suppress(XrlError):
             self.robot = robot_of(log)
-        except XrlError:
-            self.robot = None
-        if axis is None:
+        if zero_ns is None:
             zero_ns = self.course.zero_ns if self.course else log.began_ns()
-            span_ns = log.begin_ns - zero_ns, log.end_ns - 1 - zero_ns
-            axis = TimeAxis(zero_ns, Span(*(ns / NS_PER_S for ns in span_ns)))
-        self.zero_ns, self.span = axis
+        self.zero_ns = zero_ns
+        """Monotonic stamp of time 0."""
+        self.span = span or Span(self.at(log.begin_ns), self.at(log.end_ns - 1))
         self._begin_s = -np.inf if log.is_first else self.at(log.begin_ns)
         self._end_s = np.inf if log.is_last else self.at(log.end_ns)
         self._times: dict[tuple[str, str], Array] = {}

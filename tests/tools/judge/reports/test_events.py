@@ -13,7 +13,7 @@ from shared.bus.messages import DriveStatus, PlannerMode, Trip
 from shared.bus.traces import LinkEvent
 from tests.messages import sample
 from tests.tools.judge.reports import runs
-from tools.judge.reports.events import Event, events_of
+from tools.judge.reports.events import TimelineEvent, events_of
 from tools.judge.reports.run_data import RunData
 from tools.logs.run_log import RunLog
 
@@ -21,13 +21,13 @@ T_S = 2.5
 """Time of the changes in these logs, scenario time."""
 
 
-def events(log: RunLog, name: str = "", change: runs.Change | None = None) -> list[Event]:
+def events(log: RunLog, name: str = "", change: runs.Change | None = None) -> list[TimelineEvent]:
     """Return the events of a log after a change of one key's messages."""
     changes = {} if change is None else {name: change}
     return events_of(RunData(runs.changed(log, changes)))
 
 
-def violations(log: RunLog, name: str, change: runs.Change) -> list[Event]:
+def violations(log: RunLog, name: str, change: runs.Change) -> list[TimelineEvent]:
     return [row for row in events(log, name, change) if row.kind == "limit"]
 
 
