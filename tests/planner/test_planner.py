@@ -103,8 +103,7 @@ def test_all_hold_while_one_is_stale(planner: Planner, q: Array, silent: int) ->
 
 
 def test_commands_carry_each_modules_part_of_the_law(planner: Planner, q: Array) -> None:
-    receive_all(planner, q, START_NS)
-    commands = planner.tick(START_NS)
+    commands, _ = ticked(planner, q, START_NS)
     np.testing.assert_allclose(joined(commands, "q_ref"), q, atol=1e-5)
     np.testing.assert_allclose(joined(commands, "v_ref"), 0.0, atol=1e-6)
     np.testing.assert_allclose(joined(commands, "tau_coupled"), 0.0, atol=0.02)
@@ -118,12 +117,11 @@ def test_it_leads_again_from_where_it_is(planner: Planner, q: Array) -> None:
     elsewhere = closed(1.0, x=-0.03, y=0.02, roll=0.04, pitch=0.4)
     receive_all(planner, elsewhere, now, seq=90)
     planner.tick(now)
-    receive_all(planner, elsewhere, now, seq=91, ready=False, mode=int(Mode.HOLD))
-    planner.tick(now + 200 * NS_PER_MS)
-    receive_all(planner, elsewhere, now + 201 * NS_PER_MS, seq=92, ready=False, mode=int(Mode.HOLD))
-    commands = planner.tick(now + 201 * NS_PER_MS)
+    for seq in (91, 92):
+        at_ns = now + (109 + seq) * NS_PER_MS
+        held = {"ready": False, "mode": int(Mode.HOLD)}
+        commands, status = ticked(planner, elsewhere, at_ns, seq, **held)
     assert all(command.hold for command in commands)
-    status = planner.status(now + 201 * NS_PER_MS, 0.0)
     np.testing.assert_allclose(
         status.p_ref, np.array(status.p) * (0.0, 0.0, 1.0, 0.0, 1.0, 0.0), atol=1e-9
     )
@@ -164,10 +162,8 @@ def test_assist_rises_by_the_time_between_ticks_and_a_long_gap_is_not_integrated
     planner.receive_request(OperatorRequest(200.0))
     for tick in range(ticks):
         now += gap_ns
-        receive_all(planner, q, now, seq=50 + tick)
-        planner.tick(now)
-    assist = planner.status(now, 0.0).assist_n
-    assert assist == pytest.approx(ROBOT.assist.rate_max * seconds)
+        _, status = ticked(planner, q, now, 50 + tick)
+    assert status.assist_n == pytest.approx(ROBOT.assist.rate_max * seconds)
 
 
 def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
@@ -186,10 +182,7 @@ def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
 
 
 def test_both_margins_are_told(planner: Planner, q: Array) -> None:
-    now = lead(planner, q)
-    receive_all(planner, q, now, seq=50)
-    commands = planner.tick(now + 4 * NS_PER_MS)
-    status = planner.status(now + 4 * NS_PER_MS, 0.0)
+    commands, status = ticked(planner, q, lead(planner, q) + TICK_NS, 50)
     assert {command.margin for command in commands} == {status.margin}
     assert {command.margin_onboard for command in commands} == {status.margin_onboard}
     assert status.split == SplitSource.SCHEDULE
@@ -209,9 +202,7 @@ def test_gains_that_fall_hold_at_once(planner: Planner, q: Array) -> None:
     ):
         split._margins_min = Margins(1e9, 1e9) if fails else least
         now += 4 * NS_PER_MS + after_ns
-        receive_all(planner, q, now, seq=50 + tick)
-        commands = planner.tick(now)
-        status = planner.status(now, 0.0)
+        commands, status = ticked(planner, q, now, 50 + tick)
         assert (status.split == SplitSource.UNCERTIFIED) == fails
         seen.append((PlannerMode(status.mode), {command.hold for command in commands}))
     assert seen == [
