@@ -16,7 +16,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import MODULES
 from shared.robot.hold_rules import Dropouts
 from tests.joint.helpers import Bench
-from tests.planner.states import ROBOT
+from tests.planner.states import ROBOT, TICK_NS
 
 T = TypeVar("T")
 YES = [True] * 6
@@ -53,18 +53,12 @@ def test_it_waits_aligns_and_leads_in_three_steps() -> None:
 
 
 @pytest.mark.parametrize("index", range(6))
-def test_hold_is_not_lifted_while_one_module_is_not_ready(index: int) -> None:
-    engagement = Engagement(PlannerMode.ALIGNING, T0)
-    for tick in range(1000):
-        now_ns = T0 + tick * 4 * NS_PER_MS
-        engagement.advance(now_ns, YES, but(YES, index, False), HOLD)
-        assert engagement.hold
-
-
-@pytest.mark.parametrize("index", range(6))
 @pytest.mark.parametrize("mode", [PlannerMode.ALIGNING, PlannerMode.LEADING])
-def test_one_stale_state_holds_all(mode: PlannerMode, index: int) -> None:
+def test_one_stale_state_or_one_not_ready_holds_all(mode: PlannerMode, index: int) -> None:
     engagement = Engagement(mode, T0)
+    for tick in range(1000):
+        engagement.advance(T0 + tick * TICK_NS, YES, but(YES, index, False), TRACK)
+        assert engagement.hold is (mode is PlannerMode.ALIGNING), "ready counts before the lead"
     assert engagement.advance(T0, but(YES, index, False), YES, TRACK)
     assert (engagement.mode, engagement.hold) == (PlannerMode.WAITING, True)
 
@@ -73,6 +67,7 @@ def test_one_stale_state_holds_all(mode: PlannerMode, index: int) -> None:
 @pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.TRACK])
 def test_one_module_that_leaves_track_holds_all(mode: Mode, index: int) -> None:
     engagement = leading()
+    assert not any(engagement.advance(T0 + tick, YES, YES, TRACK) for tick in range(100))
     assert engagement.advance(T0, YES, YES, but(TRACK, index, int(mode)))
     assert engagement.hold
 
@@ -93,12 +88,6 @@ def test_a_module_that_can_not_come_to_track_is_not_waited_for(mode: Mode, since
     assert engagement.advance(T0 + since_ns, YES, YES, but(HOLD, 3, int(mode)))
     assert engagement.hold
     assert engagement.dropouts.count == 1
-
-
-def test_it_goes_on_leading_while_all_six_track() -> None:
-    engagement = leading()
-    assert not any(engagement.advance(T0 + tick, YES, YES, TRACK) for tick in range(100))
-    assert not engagement.hold
 
 
 class Fleet:
@@ -151,15 +140,10 @@ def test_what_is_forbidden_holds_at_once(mode: PlannerMode, inhibit: PlannerMode
     engagement.advance(T0, YES, YES, TRACK, inhibit)
     assert (engagement.mode, engagement.hold) == (inhibit, True)
     assert engagement.dropouts.count == 0 or inhibit is PlannerMode.UNCERTIFIED
-
-
-@pytest.mark.parametrize("inhibit", FORBIDDEN)
-def test_allowed_again_it_aligns_before_it_leads(inhibit: PlannerMode) -> None:
-    engagement = Engagement(inhibit, T0)
-    engagement.advance(T0 + 1, YES, YES, TRACK)
-    assert (engagement.mode, engagement.hold) == (PlannerMode.ALIGNING, True)
-    engagement.advance(T0 + 2, YES, YES, TRACK)
-    assert (engagement.mode, engagement.hold) == (PlannerMode.LEADING, False)
+    again = Engagement(inhibit, T0)
+    for now_ns, reported in ((T0 + 1, PlannerMode.ALIGNING), (T0 + 2, PlannerMode.LEADING)):
+        again.advance(now_ns, YES, YES, TRACK)
+        assert again.mode is reported
 
 
 def test_gains_at_the_edge_of_their_margin_do_not_make_it_flap() -> None:
@@ -188,9 +172,6 @@ def test_it_reports_how_long_it_waits_and_leads_when_that_is_over(dropouts: int)
         left_ns = engagement.wait_ns(now_ns)
         engagement.advance(now_ns, YES, YES, HOLD)
         assert engagement.hold is (left_ns > 0)
-
-
-TICK_NS = 4 * NS_PER_MS
 
 
 # ---- how long it waits
@@ -225,7 +206,8 @@ class Led:
 
 def test_each_drop_out_makes_the_wait_longer_up_to_half_a_minute() -> None:
     led = Led()
-    assert led.until_led() <= 3 * TICK_NS, "the first engagement does not wait"
+    assert led.until_led() <= 3 * TICK_NS, "what was lost before a planner is not its memory"
+    assert WAITS_NS[1] + GRACE_NS < NS_PER_S, "nor has one that was only stopped a wait"
     waits, counts = [], []
     for _ in range(9):
         waits.append(led.drop_out())
@@ -245,12 +227,6 @@ def test_time_in_hold_forgets_nothing() -> None:
         led.tick(cut=True)
     led.until_led()
     assert led.engagement.dropouts.count == 2
-
-
-def test_a_new_planner_has_no_wait() -> None:
-    """It is to lead within 1.5 s of its start: what was lost before it is not its memory."""
-    assert WAITS_NS[0] == 0
-    assert WAITS_NS[1] + GRACE_NS < NS_PER_S  # nor has one that was only stopped for a while
 
 
 def test_no_network_whatever_makes_seven_drop_outs_in_a_minute() -> None:

@@ -31,12 +31,9 @@ def late_ns(share: float) -> int:
     return T0 + round(assist.stale_ms * NS_PER_MS + share * assist.fade_s * 1e9)
 
 
-def test_without_an_intent_nothing_is_requested() -> None:
-    assert Intents(ROBOT.assist).request(T0) == OperatorRequest(0.0, STRAIGHT, "")
-
-
 def test_a_message_is_given_until_it_is_stale() -> None:
     intents = Intents(ROBOT.assist)
+    assert intents.request(T0) == OperatorRequest(0.0, STRAIGHT, ""), "nothing is requested yet"
     intents.receive(intent(80.0, (0.01, 0.0, 0.0, -0.02), sit=True), T0)
     for now in (T0, T0 + 1, late_ns(0.0)):
         assert intents.request(now) == OperatorRequest(
@@ -54,17 +51,10 @@ def test_then_it_fades_to_nothing_and_stays_there(share: float) -> None:
     assert request.assist_n == pytest.approx(80.0 * left)
     assert request.shift == pytest.approx((0.01 * left, 0.0, 0.0, -0.02 * left))
     assert (request.source, request.sit) == ("", False)
-
-
-def test_the_fade_is_slower_than_the_assist_may_fall() -> None:
     assert ROBOT.assist.force_max / ROBOT.assist.fade_s < ROBOT.assist.rate_max
-
-
-def test_an_intent_received_again_is_given_again() -> None:
-    intents = Intents(ROBOT.assist)
-    intents.receive(intent(80.0), T0)
-    intents.receive(intent(60.0), late_ns(0.9))
-    assert intents.request(late_ns(0.95)).assist_n == 60.0
+    again_ns = late_ns(share)
+    intents.receive(intent(60.0), again_ns)
+    assert intents.request(again_ns + 1).assist_n == 60.0
 
 
 @pytest.mark.parametrize(

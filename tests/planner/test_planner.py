@@ -1,18 +1,29 @@
-"""One planner tick without any I/O: who is heard, what is echoed, when it is time."""
+"""Planner ticks: who is heard, what is echoed, when it is due; and its state is all there is."""
 
 from __future__ import annotations
 
 import math
+import random
+from types import SimpleNamespace
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 
 from services.planner.intents import OperatorRequest
 from services.planner.law.certificate import Margins
-from services.planner.planner import EARLY_FRACTION, LATE_FRACTION, TICK_GAP_MAX_S, Planner
+from services.planner.loop import FOLLOW_NS, POLL_NS, PlannerLoop, PlannerPorts
+from services.planner.planner import (
+    EARLY_FRACTION,
+    LATE_FRACTION,
+    TICK_GAP_MAX_S,
+    Planner,
+    PlannerState,
+)
 from services.planner.watch.engagement_fsm import WAITS_NS
 from shared.arrays import Array
-from shared.bus.messages import Attitude, JointCommand, Mode, PlannerMode, SplitSource
+from shared.bus.messages import Attitude, DriveStatus, JointCommand, Mode, PlannerMode, SplitSource
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES
 from tests.imu.robots import with_imu
@@ -27,6 +38,7 @@ from tests.planner.states import (
     receive_but,
     requiring,
     state,
+    ticked,
     wrench,
 )
 
@@ -36,12 +48,15 @@ def joined(commands: list[JointCommand], name: str) -> Array:
 
 
 def test_no_commands_before_the_states_of_all_six(planner: Planner, q: Array) -> None:
+    status = planner.status(START_NS, 0.0)
+    assert (status.mode, status.hold, status.wrench_seq) == (PlannerMode.WAITING, True, -1)
+    assert status.state_seq == status.state_age_ns == (-1,) * 6
     for module in range(N_MODULES - 1):
         planner.receive_state(module, state(module, q), START_NS)
         assert planner.tick(START_NS + module) == []
+    assert np.isfinite([*status.p, *status.p_ref, *status.closure]).all()
     status = planner.status(START_NS + 10, 1.0)
-    assert status.mode == PlannerMode.WAITING
-    assert status.hold
+    assert (status.mode, status.hold) == (PlannerMode.WAITING, True)
     assert status.state_seq == (1, 1, 1, 1, 1, -1)
     assert status.state_age_ns == (10, 10, 10, 10, 10, -1)
     planner.receive_state(5, state(5, q), START_NS + 20)
@@ -88,8 +103,7 @@ def test_all_hold_while_one_is_stale(planner: Planner, q: Array, silent: int) ->
 
 
 def test_commands_carry_each_modules_part_of_the_law(planner: Planner, q: Array) -> None:
-    receive_all(planner, q, START_NS)
-    commands = planner.tick(START_NS)
+    commands, _ = ticked(planner, q, START_NS)
     np.testing.assert_allclose(joined(commands, "q_ref"), q, atol=1e-5)
     np.testing.assert_allclose(joined(commands, "v_ref"), 0.0, atol=1e-6)
     np.testing.assert_allclose(joined(commands, "tau_coupled"), 0.0, atol=0.02)
@@ -103,12 +117,11 @@ def test_it_leads_again_from_where_it_is(planner: Planner, q: Array) -> None:
     elsewhere = closed(1.0, x=-0.03, y=0.02, roll=0.04, pitch=0.4)
     receive_all(planner, elsewhere, now, seq=90)
     planner.tick(now)
-    receive_all(planner, elsewhere, now, seq=91, ready=False, mode=int(Mode.HOLD))
-    planner.tick(now + 200 * NS_PER_MS)
-    receive_all(planner, elsewhere, now + 201 * NS_PER_MS, seq=92, ready=False, mode=int(Mode.HOLD))
-    commands = planner.tick(now + 201 * NS_PER_MS)
+    for seq in (91, 92):
+        at_ns = now + (109 + seq) * NS_PER_MS
+        held = {"ready": False, "mode": int(Mode.HOLD)}
+        commands, status = ticked(planner, elsewhere, at_ns, seq, **held)
     assert all(command.hold for command in commands)
-    status = planner.status(now + 201 * NS_PER_MS, 0.0)
     np.testing.assert_allclose(
         status.p_ref, np.array(status.p) * (0.0, 0.0, 1.0, 0.0, 1.0, 0.0), atol=1e-9
     )
@@ -149,10 +162,8 @@ def test_assist_rises_by_the_time_between_ticks_and_a_long_gap_is_not_integrated
     planner.receive_request(OperatorRequest(200.0))
     for tick in range(ticks):
         now += gap_ns
-        receive_all(planner, q, now, seq=50 + tick)
-        planner.tick(now)
-    assist = planner.status(now, 0.0).assist_n
-    assert assist == pytest.approx(ROBOT.assist.rate_max * seconds)
+        _, status = ticked(planner, q, now, 50 + tick)
+    assert status.assist_n == pytest.approx(ROBOT.assist.rate_max * seconds)
 
 
 def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
@@ -171,10 +182,7 @@ def test_a_status_holds_what_the_tick_saw(planner: Planner, q: Array) -> None:
 
 
 def test_both_margins_are_told(planner: Planner, q: Array) -> None:
-    now = lead(planner, q)
-    receive_all(planner, q, now, seq=50)
-    commands = planner.tick(now + 4 * NS_PER_MS)
-    status = planner.status(now + 4 * NS_PER_MS, 0.0)
+    commands, status = ticked(planner, q, lead(planner, q) + TICK_NS, 50)
     assert {command.margin for command in commands} == {status.margin}
     assert {command.margin_onboard for command in commands} == {status.margin_onboard}
     assert status.split == SplitSource.SCHEDULE
@@ -194,9 +202,7 @@ def test_gains_that_fall_hold_at_once(planner: Planner, q: Array) -> None:
     ):
         split._margins_min = Margins(1e9, 1e9) if fails else least
         now += 4 * NS_PER_MS + after_ns
-        receive_all(planner, q, now, seq=50 + tick)
-        commands = planner.tick(now)
-        status = planner.status(now, 0.0)
+        commands, status = ticked(planner, q, now, 50 + tick)
         assert (status.split == SplitSource.UNCERTIFIED) == fails
         seen.append((PlannerMode(status.mode), {command.hold for command in commands}))
     assert seen == [
@@ -210,23 +216,13 @@ def test_gains_that_fall_hold_at_once(planner: Planner, q: Array) -> None:
     ]
 
 
-def test_a_robot_that_nothing_holds_is_never_lead(q: Array) -> None:
+def test_a_robot_that_nothing_holds_is_never_led(q: Array) -> None:
     planner = Planner(requiring(ROBOT, K_required=(1e5,) * 6), SESSION)
     for tick in range(10):
-        now = START_NS + tick * 4 * NS_PER_MS
-        receive_all(planner, q, now, seq=tick)
-        assert all(command.hold for command in planner.tick(now))
-    status = planner.status(now, 0.0)
-    assert status.mode == PlannerMode.UNCERTIFIED
-    assert status.hold
+        commands, status = ticked(planner, q, START_NS + tick * TICK_NS, tick)
+        assert all(command.hold for command in commands)
+    assert (status.mode, status.hold) == (PlannerMode.UNCERTIFIED, True)
     assert status.margin < ROBOT.certificate.margin_min
-
-
-def test_a_status_before_any_state_is_finite(planner: Planner) -> None:
-    status = planner.status(START_NS, 0.0)
-    assert (status.mode, status.hold, status.wrench_seq) == (PlannerMode.WAITING, True, -1)
-    assert status.state_seq == status.state_age_ns == (-1,) * 6
-    assert np.isfinite([*status.p, *status.p_ref, *status.closure]).all()
 
 
 def attitude(roll: float, seq: int, *, valid: bool = True) -> Attitude:
@@ -275,3 +271,119 @@ def test_an_old_wrench_eases_nothing() -> None:
     assert max(eased[:5]) > 0.1, "it was heard at first"
     assert eased[-1] < 1e-6
     assert now_ns - START_NS > NS_PER_S
+
+
+COURSES: dict[str, dict[str, Any]] = {
+    "a module that stays disarmed": {"mode": int(Mode.DISARMED), "drive": int(DriveStatus.IDLE)},
+    "another planner that leads": {"session": 99},
+    "feet astray": {},
+}
+
+
+@pytest.mark.parametrize("name", COURSES)
+def test_a_planner_goes_on_bit_for_bit(name: str) -> None:
+    """It goes on counting, with the wish, the stance and the rival that it had."""
+    changes, q = COURSES[name], closed(1.188, x=0.01, pitch=0.1)
+    if name == "feet astray":
+        q += 1e-2 * np.random.default_rng(4).normal(size=12)
+    planner, twin = (Planner(with_imu(ROBOT), SESSION) for _ in range(2))
+    planner.receive_request(OperatorRequest(0.0, (0.01, 0.0, 0.0, 0.02)))
+    seen = []
+    for tick in range(60):
+        if tick == 40:
+            text = msgspec.json.encode(planner.state)
+            twin.state = msgspec.json.decode(text, type=PlannerState)
+        now_ns = START_NS + tick * TICK_NS
+        both = []
+        for each in (planner, twin) if tick >= 40 else (planner,):
+            each.receive_wrench(wrench(-0.5 * tick, seq=tick), now_ns)
+            each.receive_attitude(attitude(1e-3 * tick, tick), now_ns)
+            both.append(ticked(each, q, now_ns, tick, v=(0.01, -0.02), **changes))
+        assert both[0] == both[-1]
+        seen.append(both[0])
+    status = seen[-1][1]
+    assert status.shift_requested == (0.01, 0.0, 0.0, 0.02)
+    if name == "a module that stays disarmed":
+        assert [seen[40][0][0].stiffen, seen[-1][0][0].stiffen] == [False, True]
+    elif name == "another planner that leads":
+        assert "99" in status.why
+    else:
+        assert math.hypot(*status.stance[:3]) > 1e-3
+
+
+PERIOD_NS = 4 * NS_PER_MS
+
+
+class Looking:
+    """A planner's loop in virtual time, and six states that are complete at given times."""
+
+    def __init__(self, *, compares: bool = False) -> None:
+        """Begin at 1 s."""
+        planner = cast(Planner, SimpleNamespace(compares_arrivals=compares))
+        self.loop = PlannerLoop(ROBOT, planner, cast(PlannerPorts, None))
+        self.now_ns, self.polls, self._ticked_ns = NS_PER_S, 0, 0
+
+    def tick_at(self, complete_ns: int, held_up_ns: int = 0) -> int:
+        """Look until the states are complete, and tick; return how late that is, ns."""
+        while self.now_ns < max(complete_ns, self._ticked_ns + PERIOD_NS // 2):
+            self.now_ns = self.loop._next_look(self.now_ns, ticked=False)
+            self.polls += 1
+        self.now_ns += held_up_ns
+        late_ns, self._ticked_ns = self.now_ns - complete_ns, self.now_ns
+        self.now_ns = self.loop._next_look(self.now_ns, ticked=True)
+        return late_ns
+
+
+def test_states_that_come_every_period_wait_for_no_longer_than_a_poll() -> None:
+    looking, dice = Looking(), random.Random(1)
+    late = []
+    for tick in range(500):
+        jitter_ns = dice.randrange(200_000)
+        late.append(looking.tick_at(NS_PER_S + tick * PERIOD_NS + jitter_ns))
+    assert max(late) <= POLL_NS + FOLLOW_NS
+    assert looking.polls < 5 * 500, "between two ticks it rests"
+
+
+@pytest.mark.parametrize("held_up_ns", [NS_PER_MS, 2 * NS_PER_MS, 3 * NS_PER_MS, 8 * NS_PER_MS])
+def test_after_a_late_tick_they_are_soon_in_time(held_up_ns: int) -> None:
+    looking = Looking()
+    for tick in range(100):
+        late_ns = looking.tick_at(NS_PER_S + tick * PERIOD_NS, held_up_ns if tick == 50 else 0)
+        assert late_ns <= POLL_NS + FOLLOW_NS or 50 <= tick <= 50 + 2 * held_up_ns // PERIOD_NS + 1
+
+
+@pytest.mark.parametrize("busy_ns", [NS_PER_MS, 3 * NS_PER_MS // 2])
+def test_kept_from_looking_it_does_not_stay_late(busy_ns: int) -> None:
+    """They run for a while before the states are complete; it then found those of a period ago."""
+    loop = Looking().loop
+    complete = [NS_PER_S + tick * PERIOD_NS for tick in range(100)]
+    now_ns, taken, ages = complete[1] - 100_000, 0, []
+    ticked_ns = 0
+    while taken < 90:
+        newest = (now_ns - NS_PER_S) // PERIOD_NS
+        ticked = newest > taken and now_ns - ticked_ns >= PERIOD_NS // 2
+        if ticked or (not ages and newest >= 0):
+            ticked, taken, ticked_ns = True, max(taken, newest), now_ns
+            ages.append(now_ns - complete[newest])
+        now_ns = loop._next_look(now_ns, ticked=ticked)
+        until_ns = PERIOD_NS - (now_ns - NS_PER_S) % PERIOD_NS
+        if 100_000 < until_ns < busy_ns:  # kept until just before the next are complete
+            now_ns += until_ns - 100_000
+    assert ages[0] > 3 * NS_PER_MS, "it began a period late"
+    assert max(ages[5:]) <= 2 * POLL_NS
+
+
+def test_after_a_long_gap_it_rests_again() -> None:
+    looking = Looking()
+    looking.tick_at(NS_PER_S)
+    looking.tick_at(3 * NS_PER_S)
+    before = looking.polls
+    for tick in range(1, 50):
+        looking.tick_at(3 * NS_PER_S + tick * PERIOD_NS)
+    assert looking.polls - before < 5 * 50
+
+
+def test_while_arrivals_are_compared_it_does_not_rest() -> None:
+    looking = Looking(compares=True)
+    looking.tick_at(NS_PER_S)
+    assert looking.loop._next_look(looking.now_ns, ticked=True) == looking.now_ns + POLL_NS

@@ -20,8 +20,8 @@ from tests.planner.states import (
     TICK_NS,
     closed,
     lead,
-    receive_all,
     state,
+    ticked,
     wrench,
 )
 
@@ -58,10 +58,8 @@ def test_absurd_angles_alone_are_silence(planner: Planner, angle: float) -> None
     wrong[4] = angle
     for seq in range(10, 40):
         now_ns += TICK_NS
-        receive_all(planner, wrong, now_ns, seq)
-        commands = planner.tick(now_ns)
+        commands, status = ticked(planner, wrong, now_ns, seq)
     assert all(command.hold for command in commands)
-    status = planner.status(now_ns, 0.0)
     assert status.mode == PlannerMode.WAITING
     assert status.state_seq[2] < 10 <= status.state_seq[3]
     assert all(math.isfinite(value) for command in commands for value in command.q_ref)
@@ -76,15 +74,13 @@ def test_whatever_angles_come_no_tick_ends_and_it_leads_again_by_good_ones(
     now_ns = lead(planner, good) if led else START_NS
     for seq in range(10, 14):
         now_ns += TICK_NS
-        receive_all(planner, np.array(angles), now_ns, seq, v=(speed, 0.0))
-        planner.tick(now_ns)
+        ticked(planner, np.array(angles), now_ns, seq, v=(speed, 0.0))
     for seq in range(20, 2600):
         now_ns += TICK_NS
-        receive_all(planner, good, now_ns, seq)
-        commands = planner.tick(now_ns)
+        commands, status = ticked(planner, good, now_ns, seq)
         if seq > 22 and not commands[0].hold:
             break
-    assert planner.status(now_ns, 0.0).mode == PlannerMode.LEADING
+    assert status.mode == PlannerMode.LEADING
     assert all(math.isfinite(value) for command in commands for value in command.tau_coupled)
 
 
@@ -127,12 +123,10 @@ def test_a_second_of_an_absurd_wrench_leaves_no_trace(planner: Planner, force: f
     now_ns = lead(planner, q)
     for seq in range(10, 2500):
         now_ns += TICK_NS
-        receive_all(planner, q, now_ns, seq)
         planner.receive_wrench(wrench(force if seq < 260 else 0.0, seq=seq), now_ns)
-        commands = planner.tick(now_ns)
-        if seq > 300 and planner.status(now_ns, 0.0).mode == PlannerMode.LEADING:
+        commands, status = ticked(planner, q, now_ns, seq)
+        if seq > 300 and status.mode == PlannerMode.LEADING:
             break
-    status = planner.status(now_ns, 0.0)
     assert status.mode == PlannerMode.LEADING
     assert abs(status.load[0]) < (ROBOT.law.load_correction[0] if force < 9000.0 else 0.1)
     assert status.refused == (250 if force > 9000.0 else 0)
