@@ -22,7 +22,7 @@ from shared.places import CHECKOUT
 _PLOT: Final = ("matplotlib", "PIL")
 
 EXTRAS: Final = {
-    "sim": ("mujoco", *_PLOT),
+    "sim": ("joblib", "mujoco", *_PLOT),
     "plot": _PLOT,
     "design": ("cvxpy",),
     "view": ("aiohttp",),
@@ -32,7 +32,7 @@ EXTRAS: Final = {
     "parquet": ("pyarrow",),
     "pad": ("evdev",),
     "cluster": ("distributed",),
-    "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
+    "bench": ("cyclonedds", "iceoryx2", "zmq"),
 }
 """The packages of each extra, as they are imported."""
 

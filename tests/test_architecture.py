@@ -85,8 +85,6 @@ VENDORS = {
     "matplotlib": [
         "tools/output.py",
         "tools/judge/figure.py",
-        "tools/lab/studies/sweeps/kill.py",
-        "tools/lab/studies/sweeps/latency_report.py",
     ],
     "PIL": ["tools/judge/reports/moving_picture.py"],
     "casadi": [
@@ -541,7 +539,7 @@ def test_only_simulations_know_the_centralised_baseline_and_no_robot_file_names_
     assert {file for file in users if not file.startswith("tests/")} == {
         "tools/sim/recorded_lockstep.py",
         "tools/verbs/sim.py",
-        "tools/lab/studies/sweeps/latency_trial.py",
+        "tools/lab/studies/sweeps/latency.py",
         "tools/sim/centralised/fleet.py",
     }
     for file in (ROOT / "deploy").rglob("*.toml"):

@@ -5,11 +5,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 import pytest
 
-from shared.bus.messages import HeatAction, PlannerMode
+from services.joint.differential import motor_torque
+from services.joint.heat import HeatEstimate
+from services.planner.law.kinematics import Kinematics
+from shared.bus.messages import LEFT_MAX_S, HeatAction, PlannerMode
 from shared.bus.traces import SimTruth
-from shared.config.robot_config import RobotConfig
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.robot.robot_model import stand_pose
 from tests.lockstep.runs import led_to, standing_as, status_of
 from tools.sim.lockstep import FleetMoment, Lockstep
 
@@ -72,3 +77,33 @@ def test_without_an_estimate_nothing_is_said_and_nothing_done(robot: RobotConfig
     held = hold(deaf, standing_as(deaf), skip=False, until_s=1.0)
     assert set(held.actions) == {HeatAction.NONE}
     assert status_of(held.fleet).heat_left_s == -1.0
+
+
+@pytest.mark.parametrize(
+    ("height", "assist_n", "minutes"),
+    [
+        (0.948, 0.0, {20.0: 19.2, 45.0: 6.2}),
+        (0.948, 200.0, {20.0: 2.8, 45.0: 1.0}),
+        (1.07, 0.0, {20.0: 18.8, 45.0: 6.0}),
+        (1.25, 0.0, {20.0: LEFT_MAX_S / 60.0, 45.0: LEFT_MAX_S / 60.0}),
+    ],
+)
+def test_a_pose_can_be_held_as_long_as_the_results_say(
+    robot: RobotConfig, height: float, assist_n: float, minutes: dict[float, float]
+) -> None:
+    """docs/results.md#held-poses, from motors as warm as the air."""
+    kinematics = Kinematics(robot)
+    kinematics.update(np.array(stand_pose(robot, height)))
+    weight_n = robot.total_mass * GRAVITY
+    tau = weight_n * kinematics.J[2] + assist_n * kinematics.J_harness[2]
+    for ambient, expected in minutes.items():
+        heat = msgspec.structs.replace(robot.heat, ambient=ambient)
+        day = msgspec.structs.replace(robot, heat=heat)
+        left = []
+        for phi, theta in tau.reshape(-1, 2).tolist():
+            estimate = HeatEstimate(day)
+            a, b = motor_torque((phi, theta), robot.joint.gear_ratio)
+            estimate.state.load = (a * a, b * b)
+            estimate.skip(0.0)
+            left.append(estimate.state.left_s)
+        assert min(left) / 60.0 == pytest.approx(expected, rel=0.02, abs=0.06)
