@@ -67,12 +67,13 @@ def held_alone(robot: RobotConfig, q: Array, D: Array, tau_ff: Array, height: fl
     taus = [setpoint.tau_ff for setpoint, _ in laws]
     motor = np.zeros(N_JOINTS)
     for _ in range(round(LASTS_S * robot.joint_service.rate_hz)):
-        turns, rates = (values.reshape(-1, 2).tolist() for values in world.motor_turns())
+        turns, rates = (values.tolist() for values in world.motor_turns())
         for index, (setpoint, limits) in enumerate(laws):
-            at = differential.joint_from_motor(tuple(turns[index]), ratio)
-            v = differential.joint_from_motor(tuple(rates[index]), ratio)
+            a, b = 2 * index, 2 * index + 1
+            at = differential.joint_from_motor((turns[a], turns[b]), ratio)
+            v = differential.joint_from_motor((rates[a], rates[b]), ratio)
             taus[index] = limit_torque(torque(setpoint, at, v), at, taus[index], limits)
-            motor[2 * index : 2 * index + 2] = differential.motor_torque(taus[index], ratio)
+            motor[a], motor[b] = differential.motor_torque(taus[index], ratio)
         for _ in range(round(1.0 / (robot.joint_service.rate_hz * world.timestep))):
             world.step(motor)
         truth = world.truth(0, 1.0, 0.0)

@@ -16,6 +16,7 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.states import SESSION, with_law
+from tools.reach import ReachSolver
 
 Closed = Callable[..., Array]
 """closed(height, x=, y=, roll=, pitch=, yaw=) -> q (12,) where the legs agree."""
@@ -42,8 +43,8 @@ def limits(robot: RobotConfig) -> Array:
 
 
 @pytest.fixture(scope="session")
-def ik(robot: RobotConfig, limits: Array) -> InverseKinematics:
-    return InverseKinematics(Kinematics(robot), limits)
+def ik(robot: RobotConfig, limits: Array) -> ReachSolver:
+    return ReachSolver(Kinematics(robot), limits)
 
 
 def com_height(robot: RobotConfig, height: float) -> float:
@@ -66,7 +67,7 @@ def at_pose(robot: RobotConfig, ik: InverseKinematics, p: Array, start: Array) -
 
 
 @pytest.fixture(scope="session")
-def closed(robot: RobotConfig, ik: InverseKinematics) -> Closed:
+def closed(robot: RobotConfig, ik: ReachSolver) -> Closed:
     @cache
     def made(height: float, parts: frozenset[tuple[str, float]]) -> Array:
         start = np.array(stand_pose(robot, 1.188))

@@ -8,13 +8,14 @@ import math
 import numpy as np
 import pytest
 
-from services.planner.law.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
+from services.planner.law.inverse_kinematics import TOLERANCE
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.conftest import Closed, com_height, p_at
+from tools.reach import IkEnding, ReachSolver, describe
 
 KNEES = (3, 9)
 
@@ -29,12 +30,12 @@ def true_residual(robot: RobotConfig, q: Array, p_ref: Array) -> float:
     return float(max(np.abs(error).max() for error in errors))
 
 
-def assert_reached(robot: RobotConfig, ik: InverseKinematics, p_ref: Array, limits: Array) -> None:
+def assert_reached(robot: RobotConfig, ik: ReachSolver, p_ref: Array, limits: Array) -> None:
     assert true_residual(robot, ik.q, p_ref) <= 2 * TOLERANCE, p_ref
     assert_within(ik.q, limits)
 
 
-def counted(monkeypatch: pytest.MonkeyPatch, ik: InverseKinematics) -> list[int]:
+def counted(monkeypatch: pytest.MonkeyPatch, ik: ReachSolver) -> list[int]:
     """Count in the list's only entry how often the kinematics are computed."""
     count, update = [0], ik.kinematics.update
 
@@ -52,7 +53,7 @@ def assert_within(q: Array, limits: Array) -> None:
 
 
 def test_the_stand_converges_to_any_pose_of_the_workspace(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+    robot: RobotConfig, ik: ReachSolver, limits: Array, closed: Closed
 ) -> None:
     """Torso 0.85..1.20 m with every offset; nearer the ends a leg cannot reach them all."""
     rng = np.random.default_rng(11)
@@ -73,7 +74,7 @@ def test_the_stand_converges_to_any_pose_of_the_workspace(
 
 
 def test_a_squat_takes_at_most_two_iterations_a_tick_and_as_many_kinematics(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed, monkeypatch: pytest.MonkeyPatch
+    robot: RobotConfig, ik: ReachSolver, closed: Closed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Warm, without a search."""
     ik.q[:] = closed(1.188)
@@ -89,7 +90,7 @@ def test_a_squat_takes_at_most_two_iterations_a_tick_and_as_many_kinematics(
 
 
 def test_out_of_reach_a_tick_computes_the_kinematics_three_times(
-    ik: InverseKinematics, closed: Closed, monkeypatch: pytest.MonkeyPatch
+    ik: ReachSolver, closed: Closed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The third takes back a step that led nowhere, once it is at a limit."""
     ik.q[:] = closed(0.948)
@@ -101,7 +102,7 @@ def test_out_of_reach_a_tick_computes_the_kinematics_three_times(
 
 
 def test_an_unreachable_pose_keeps_the_limits_is_reported_and_ends_no_worse_than_it_began(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+    robot: RobotConfig, ik: ReachSolver, limits: Array, closed: Closed
 ) -> None:
     ik.q[:] = closed(1.188)
     at_start = true_residual(robot, ik.q, HIGH)
@@ -113,7 +114,7 @@ def test_an_unreachable_pose_keeps_the_limits_is_reported_and_ends_no_worse_than
 
 
 def test_the_residual_is_true_where_a_limit_stops_the_step(
-    robot: RobotConfig, ik: InverseKinematics, closed: Closed
+    robot: RobotConfig, ik: ReachSolver, closed: Closed
 ) -> None:
     """A pose crept beyond the knee's limit must not be reported as reached."""
     ik.q[:] = closed(1.25)
@@ -161,7 +162,7 @@ def reachable(robot: RobotConfig, limits: Array, rng: np.random.Generator) -> tu
 
 
 def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array
+    robot: RobotConfig, ik: ReachSolver, limits: Array
 ) -> None:
     """None of 7 500 such poses failed, each from a random start and from a stand."""
     rng = np.random.default_rng(2024)
@@ -175,7 +176,7 @@ def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
 
 
 def test_a_pose_beyond_the_fold_is_reached_and_reported_so(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+    robot: RobotConfig, ik: ReachSolver, limits: Array, closed: Closed
 ) -> None:
     """Made with a left knee twisted by -0.535 rad; every stand ends 0.35 mm short of it."""
     p_ref = np.array([-0.07247, 0.06702, 0.90433, -0.03099, 0.82851, 0.13846])
@@ -201,7 +202,7 @@ def p_unreachable(request: pytest.FixtureRequest) -> Array:
 
 
 def test_out_of_reach_it_ends_inside_the_limits_with_legs_that_agree(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, p_unreachable: Array
+    robot: RobotConfig, ik: ReachSolver, limits: Array, closed: Closed, p_unreachable: Array
 ) -> None:
     rng, misses = np.random.default_rng(3), []
     for start in (rng.uniform(*limits.T), closed(1.188), closed(0.85, pitch=1.0)):
@@ -219,7 +220,7 @@ def test_out_of_reach_it_ends_inside_the_limits_with_legs_that_agree(
 
 
 def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, p_unreachable: Array
+    robot: RobotConfig, ik: ReachSolver, limits: Array, closed: Closed, p_unreachable: Array
 ) -> None:
     """By the oracle, to first order: moves of 1 mrad that keep the legs together."""
     ik.q[:] = closed(1.188)
@@ -239,7 +240,7 @@ def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
         assert nearer <= 2e-6 or np.abs(C @ move).max() > 1e-9
 
 
-def test_out_of_reach_it_gets_no_worse(robot: RobotConfig, ik: InverseKinematics) -> None:
+def test_out_of_reach_it_gets_no_worse(robot: RobotConfig, ik: ReachSolver) -> None:
     """A start near the best pose there is, where all other starts end 8 mm further away."""
     right, left = [0.1676, 0.1146, -0.5614, -0.5274, 0.3547], [0.0495, 0.0588, -0.2621, -0.9647]
     ik.q[:] = np.array([*right, 1.5819, *left, 0.2394, 2.0868])
@@ -252,7 +253,7 @@ TOO_HIGH = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
 
 
 def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed
+    robot: RobotConfig, ik: ReachSolver, limits: Array, closed: Closed
 ) -> None:
     ik.q[:] = closed(1.188)
     reach = ik.solve_from_anywhere(TOO_HIGH)
@@ -264,7 +265,7 @@ def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(
     )
     wide = limits.copy()
     wide[list(KNEES), 1] = 0.3
-    beyond = InverseKinematics(Kinematics(robot), wide)
+    beyond = ReachSolver(Kinematics(robot), wide)
     beyond.q[:] = stand_pose(robot, 1.188)
     reach = beyond.solve_from_anywhere(TOO_HIGH)
     assert (reach.outcome, set(reach.stopped)) == (IkEnding.OUT_OF_REACH, {0}), "straight legs"
@@ -272,7 +273,7 @@ def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(
 
 
 def test_a_configuration_on_the_way_is_not_called_the_nearest(
-    ik: InverseKinematics, limits: Array, closed: Closed
+    ik: ReachSolver, limits: Array, closed: Closed
 ) -> None:
     ik.q[:] = closed(1.0)
     reach = ik.examine(TOO_HIGH)
@@ -285,7 +286,7 @@ def test_a_configuration_on_the_way_is_not_called_the_nearest(
 
 
 def test_the_same_start_and_pose_give_the_same_bits(
-    ik: InverseKinematics, closed: Closed, p_unreachable: Array
+    ik: ReachSolver, closed: Closed, p_unreachable: Array
 ) -> None:
     ik.q[:] = closed(1.0)
     ik.solve_from_anywhere(p_unreachable)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from services.planner.law.gains import GainLaw
-from services.planner.law.inverse_kinematics import TOLERANCE, InverseKinematics
+from services.planner.law.inverse_kinematics import TOLERANCE
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainSplit
 from shared.arrays import Array
@@ -23,6 +23,7 @@ from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.conftest import Closed
 from tests.planner.states import WEIGHT, with_law
+from tools.reach import ReachSolver
 
 KNEES = [3, 9]
 
@@ -132,7 +133,7 @@ def test_the_gains_go_through_straight_knees_without_a_jump(path: Path) -> None:
 def test_local_gains_pass_straight_knees_smoothly(leaning: Path, limits: Array, split: str) -> None:
     robot = leaning.robot
     splitting, gain_law = GainSplit(with_law(robot, split=split)), GainLaw(robot)
-    ik = InverseKinematics(Kinematics(robot), limits)
+    ik = ReachSolver(Kinematics(robot), limits)
     local = []
     for q in leaning.q:
         T = per_p(ik, q)
@@ -145,7 +146,7 @@ def test_local_gains_pass_straight_knees_smoothly(leaning: Path, limits: Array, 
         assert np.abs(np.diff(values, axis=0)).max() <= slope * STEP
 
 
-def per_p(ik: InverseKinematics, q: Array) -> Array:
+def per_p(ik: ReachSolver, q: Array) -> Array:
     """Return joint rates per unit of p (12, 6) at q, as the law makes them."""
     ik.q[:] = q
     ik.examine(np.zeros(6))
@@ -154,7 +155,7 @@ def per_p(ik: InverseKinematics, q: Array) -> Array:
 
 def test_rates_never_exceed_the_motion_they_follow(leaning: Path, limits: Array) -> None:
     """The robot led through straight knees: v_ref = T S J v."""
-    ik = InverseKinematics(Kinematics(leaning.robot), limits)
+    ik = ReachSolver(Kinematics(leaning.robot), limits)
     S = np.array(leaning.robot.law.S)
     for before, q, after in zip(leaning.q, leaning.q[1:], leaning.q[2:], strict=False):
         v = (after - before) / (2 * STEP)
@@ -165,7 +166,7 @@ def test_rates_never_exceed_the_motion_they_follow(leaning: Path, limits: Array)
 
 def test_rates_are_bounded_whatever_is_asked(path: Path, limits: Array) -> None:
     """By the damping: 1 / (2 * 1e-4) per unit of pdot. Undamped, no number bounds them."""
-    ik = InverseKinematics(Kinematics(path.robot), limits)
+    ik = ReachSolver(Kinematics(path.robot), limits)
     largest = max(float(np.linalg.norm(per_p(ik, q), 2)) for q in path.q)
     assert largest <= 5000.0
     at_straight = path.q[100]
@@ -183,7 +184,7 @@ def led(z: float) -> Array:
 
 @pytest.mark.parametrize("beyond", [0.001, 0.01, 0.1])
 def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_no_trace(
-    robot: RobotConfig, ik: InverseKinematics, limits: Array, closed: Closed, beyond: float
+    robot: RobotConfig, ik: ReachSolver, limits: Array, closed: Closed, beyond: float
 ) -> None:
     start = closed(1.188)
     low = float(oracle.pose(robot, start)[2])
@@ -217,7 +218,7 @@ def test_with_knees_free_to_straighten_a_height_beyond_is_finite_and_the_least_m
     """With straight knees only the legs' lean from ankle to hip remains."""
     wide = limits.copy()
     wide[KNEES, 1] = 0.1
-    ik = InverseKinematics(Kinematics(robot), wide)
+    ik = ReachSolver(Kinematics(robot), wide)
     ik.q[:] = closed(1.188)
     straight = float(oracle.pose(robot, leaning.q[100])[2])
     for z in np.linspace(0.92, straight + 0.1, 500):

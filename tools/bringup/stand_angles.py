@@ -6,13 +6,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from services.planner.law.inverse_kinematics import InverseKinematics, describe
 from services.planner.law.kinematics import Kinematics
 from shared.bus.messages import Pair
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
 from shared.robot.robot_model import stand_pose
+from tools.reach import ReachSolver, describe
 
 HEIGHT_TOLERANCE: Final = 1e-7
 """m of torso height"""
@@ -38,7 +38,7 @@ def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
         raise RunError(text + in_mm)
     limits = np.array(robot.joint_limits())
     kinematics = Kinematics(robot)
-    ik = InverseKinematics(kinematics, limits)
+    ik = ReachSolver(kinematics, limits)
     ik.q[:] = stand_pose(robot, height)
     kinematics.update(ik.q)
     p_ref = np.array([0.0, 0.0, kinematics.p[2], 0.0, 0.0, 0.0])
