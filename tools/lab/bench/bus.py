@@ -1,9 +1,8 @@
 """`xrl bench bus`: the fleet's pattern of messages over every transport that is installed.
 
-Six modules and a planner, each in a process of its own, with the services' own encoding, rates and
-priorities, without laws and drives. A module publishes its state
-in every other cycle and takes the newest command in each. The planner publishes six commands once
-six new states are there.
+Six modules and a planner, each a process at the services' rates and priority, without laws and
+drives. A module publishes a state in every other cycle and takes the newest command in each. The
+planner publishes six commands once six new states are there.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ import importlib.util
 import multiprocessing
 import os
 import socket
+import struct
 import tempfile
 import time
 import zlib
@@ -22,15 +22,12 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any, Final, NamedTuple, TypeVar
+from typing import Annotated, Any, Final
 
-import msgspec
 import numpy as np
 from rich.progress import track
 
 from shared import scheduling
-from shared.bus.codec import Decoder, encode
-from shared.bus.messages import JointCommand, JointState, Message
 from shared.bus.session import open_session
 from shared.clock import NS_PER_S, NS_PER_US, sleep_until
 from shared.config import files as config_file
@@ -46,7 +43,6 @@ iox2, zmq = late("iceoryx2"), late("zmq")
 PARTS: Final = ("core", "domain", "topic", "pub", "sub", "idl", "idl.types")
 dds, dds_domain, dds_topic, pub, sub, idl, dds_types = (late(f"cyclonedds.{p}") for p in PARTS)
 
-M = TypeVar("M", bound=Message)
 Put = Callable[[bytes], object]
 Take = Callable[[], "bytes | None"]
 """Returns the newest payload if it was not taken before. Neither blocks."""
@@ -57,6 +53,8 @@ CYCLE_NS, TICK_NS, POLL_NS = 2_000_000, 4_000_000, 400 * NS_PER_US
 WARM_UP_S: Final = 1.5
 """Time until all links are there; nothing of it is counted."""
 PLANNER: Final = "planner"
+MESSAGE: Final = struct.Struct("q440x")
+"""The time at which it was put; as long as the fleet's states and commands."""
 
 
 def over_zenoh(process: str, folder: Path) -> End:
@@ -78,13 +76,13 @@ def over_datagrams(_process: str, folder: Path) -> End:
 
         def put(payload: bytes) -> None:
             with suppress(OSError):  # no reader yet, or its socket is full
-                end.sendto(payload, socket.MSG_DONTWAIT, _file(folder, key))
+                end.sendto(payload, socket.MSG_DONTWAIT, str(folder / key))
 
         return put
 
     def latest(key: str) -> Take:
         end = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        end.bind(_file(folder, key))
+        end.bind(str(folder / key))
 
         def take() -> bytes | None:
             newest = None
@@ -104,14 +102,14 @@ def over_zmq(_process: str, folder: Path) -> End:
 
     def publisher(key: str) -> Put:
         end = context.socket(zmq.PUB)
-        end.bind(f"ipc://{_file(folder, key)}")
+        end.bind(f"ipc://{folder / key!s}")
         return lambda payload: end.send(payload, zmq.NOBLOCK)
 
     def latest(key: str) -> Take:
         end = context.socket(zmq.SUB)
         end.setsockopt(zmq.CONFLATE, 1)
         end.setsockopt(zmq.SUBSCRIBE, b"")
-        end.connect(f"ipc://{_file(folder, key)}")
+        end.connect(f"ipc://{folder / key!s}")
         return lambda: bytes(end.recv(zmq.NOBLOCK)) if end.poll(0) else None
 
     return publisher, latest
@@ -167,7 +165,7 @@ def over_cyclonedds(_process: str, folder: Path) -> End:
     participant = dds_domain.DomainParticipant(zlib.crc32(str(folder).encode()) % 200)
 
     def topic(key: str) -> Any:
-        return dds_topic.Topic(participant, key.replace("/", "_"), kind, qos=qos)
+        return dds_topic.Topic(participant, key, kind, qos=qos)
 
     def publisher(key: str) -> Put:
         end = pub.DataWriter(participant, topic(key), qos=qos)
@@ -185,10 +183,6 @@ def over_cyclonedds(_process: str, folder: Path) -> End:
     return publisher, latest
 
 
-def _file(folder: Path, key: str) -> str:
-    return str(folder / key.replace("/", "."))
-
-
 TRANSPORTS: Final = {
     "zenoh": (over_zenoh, "zenoh"),
     "datagrams": (over_datagrams, "socket"),
@@ -199,68 +193,46 @@ TRANSPORTS: Final = {
 """How a process joins, and the package that it needs."""
 
 
-class Seen(NamedTuple):
-    """What one process saw."""
-
-    latency_us: list[float]
-    """Time of each command from the planner's put to the module's take, after the warm-up."""
-    missed: int
-    """Commands that one cycle could have taken, and a later one took."""
-    cpu: float = 0.0
-    """CPU time of all its threads, as a fraction of one core."""
+Seen = tuple[list[float], int, float]
+"""Of one process after the warm-up: us from the planner's put to the module's take of each command,
+commands that a cycle missed which could have taken them, and CPU time as a fraction of a core."""
 
 
-def run_module(end: End, name: str, begin_ns: int, end_ns: int) -> Seen:
+def run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[float], int]:
     """Run a module's cycles; count from `begin_ns` on."""
-    put, take = end[0](f"state/{name}"), end[1](f"command/{name}")
-    decoder, latencies, missed = Decoder(JointCommand), list[float](), 0
+    put, take = end[0](f"state_{name}"), end[1](f"command_{name}")
+    latencies, missed = list[float](), 0
     due, before_ns, cycle = time.monotonic_ns(), 0, 0
     while due < end_ns:
         now = time.monotonic_ns()
-        if (payload := take()) and (command := decoder.decode(payload)) and now >= begin_ns:
-            latencies.append((now - command.t_ns) * 1e-3)
-            missed += command.t_ns < before_ns
+        if (payload := take()) is not None and now >= begin_ns:
+            (sent_ns,) = MESSAGE.unpack(payload)
+            latencies.append((now - sent_ns) * 1e-3)
+            missed += sent_ns < before_ns
         cycle += 1
         if cycle % 2 == 0:
-            put(_filled(JointState, t_ns=now, seq=cycle))
+            put(MESSAGE.pack(now))
         before_ns = now
         due = max(due + CYCLE_NS, now)
         sleep_until(due)
-    return Seen(latencies, missed)
+    return latencies, missed
 
 
-def run_planner(end: End, _name: str, _begin_ns: int, end_ns: int) -> Seen:
+def run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[float], int]:
     """Run the planner's ticks."""
-    takes = [end[1](f"state/{module}") for module in MODULES]
-    puts = [end[0](f"command/{module}") for module in MODULES]
-    decoder = Decoder(JointState)
-    fresh, last_ns, seq = set[int](), 0, 0
+    takes = [end[1](f"state_{module}") for module in MODULES]
+    puts = [end[0](f"command_{module}") for module in MODULES]
+    fresh, last_ns = set[int](), 0
     while (now := time.monotonic_ns()) < end_ns:
-        fresh |= {i for i, take in enumerate(takes) if (p := take()) and decoder.decode(p)}
+        fresh |= {index for index, take in enumerate(takes) if take() is not None}
         if len(fresh) < len(MODULES) and now - last_ns < 1.25 * TICK_NS:
             sleep_until(now + POLL_NS)
             continue
-        seq += 1
         for put in puts:
-            put(_filled(JointCommand, t_ns=time.monotonic_ns(), seq=seq))
+            put(MESSAGE.pack(time.monotonic_ns()))
         fresh, last_ns = set(), now
         sleep_until(now + round(0.8 * TICK_NS))
-    return Seen([], 0)
-
-
-FILLING: Final = {
-    int: 123_456_789,
-    bool: True,
-    float: 0.25,
-    tuple: (123.45678901234567, -0.6123456789),
-}
-
-
-def _filled(kind: type[M], **values: int) -> bytes:
-    """Return a message about as long as the fleet's, encoded as the services do."""
-    kinds = {f.name: getattr(f.type, "__origin__", f.type) for f in msgspec.structs.fields(kind)}
-    filled: dict[str, Any] = {name: FILLING[one] for name, one in kinds.items()} | values
-    return encode(kind(**filled))
+    return [], 0
 
 
 def measure(transport: str, seconds: float) -> dict[str, float]:
@@ -283,19 +255,18 @@ def run_process(transport: str, folder: str, name: str, seconds: float) -> Seen:
     begin_ns, cpu_ns = time.monotonic_ns(), time.process_time_ns()
     counted_ns = begin_ns + round(WARM_UP_S * NS_PER_S)
     end_ns = counted_ns + round(seconds * NS_PER_S)
-    seen = (run_planner if name == PLANNER else run_module)(end, name, counted_ns, end_ns)
-    cpu = (time.process_time_ns() - cpu_ns) / (time.monotonic_ns() - begin_ns)
-    return seen._replace(cpu=cpu)
+    found = (run_planner if name == PLANNER else run_module)(end, name, counted_ns, end_ns)
+    return *found, (time.process_time_ns() - cpu_ns) / (time.monotonic_ns() - begin_ns)
 
 
 def figures(transport: str, seen: Sequence[Seen]) -> dict[str, float]:
     """Return a transport's figures from what its seven processes saw; by heading."""
-    latencies = np.concatenate([one.latency_us for one in seen])
+    each, missed, cpu = zip(*seen, strict=True)
+    latencies = np.concatenate(each)
     if not latencies.size:
         raise RunError(f"{transport}: no command arrived")
     p50, p99, p999 = (1e-3 * np.percentile(latencies, [50.0, 99.0, 99.9])).tolist()
-    missed, cpu = sum(one.missed for one in seen) / latencies.size, sum(one.cpu for one in seen)
-    percents = {"missed %": 100.0 * missed, "CPU %": 100.0 * cpu}
+    percents = {"missed %": 100.0 * sum(missed) / latencies.size, "CPU %": 100.0 * sum(cpu)}
     return {"p50 ms": p50, "p99 ms": p99, "p99.9 ms": p999} | percents
 
 
@@ -327,9 +298,8 @@ def run(flags: BusFlags) -> int:
     print_table(
         console,
         {"": list(names)} | columns,
-        "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. "
-        "Missed: a command came a cycle later than it could have. CPU: of all seven processes, in "
-        "percent of one core.",
+        "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. Missed: a "
+        "command came a cycle later than it could have. CPU: of all processes, of one core.",
     )
     write_rows(flags.json, rows)
     return 0

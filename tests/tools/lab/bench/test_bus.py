@@ -12,21 +12,21 @@ from tools.lab.bench.bus import Seen, over_datagrams
 
 
 def test_figures_are_over_the_commands_of_all_modules() -> None:
-    seen = [Seen([1000.0] * 99, 9, 0.05), Seen([3000.0], 1, 0.05), Seen([], 0, 0.05)]
+    seen: list[Seen] = [([1000.0] * 99, 9, 0.05), ([3000.0], 1, 0.05), ([], 0, 0.05)]
     found = bus.figures("zmq", seen)
     assert found["p50 ms"] == 1.0
     assert found["p99.9 ms"] > 2.5
     assert found["missed %"] == pytest.approx(10.0)
     assert found["CPU %"] == pytest.approx(15.0)
     with pytest.raises(RunError, match="zmq: no command arrived"):
-        bus.figures("zmq", [Seen([], 0)])
+        bus.figures("zmq", [([], 0, 0.0)])
 
 
 def test_over_datagrams_the_newest_payload_is_taken_once(tmp_path: Path) -> None:
     (_, latest), (publisher, _) = (over_datagrams(name, tmp_path) for name in ("a", "b"))
-    put = publisher("state/a")
+    put = publisher("state_a")
     put(b"nobody is there yet")
-    take = latest("state/a")
+    take = latest("state_a")
     assert take() is None
     for number in range(3):
         put(b"%d" % number)

@@ -57,7 +57,7 @@ class CaseTable:
         self._rows: dict[int, dict[str, str]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8")
+            self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8", errors="replace")
             try:
                 self._claim(inputs)
                 self._read()
