@@ -21,7 +21,7 @@ from shared.places import CHECKOUT
 _PLOT: Final = ("matplotlib", "PIL")
 
 EXTRAS: Final = {
-    "sim": ("mujoco", "scipy", *_PLOT),
+    "sim": ("joblib", "mujoco", "scipy", *_PLOT),
     "plot": _PLOT,
     "design": ("cvxpy", "scipy"),
     "view": ("aiohttp",),
@@ -30,7 +30,7 @@ EXTRAS: Final = {
     "usb": ("odrive",),
     "pad": ("sdl2", "sdl2dll"),
     "cluster": ("distributed",),
-    "bench": ("cyclonedds", "iceoryx2", "lcm", "zmq"),
+    "bench": ("cyclonedds", "iceoryx2", "zmq"),
 }
 """The packages of each extra, as they are imported."""
 

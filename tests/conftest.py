@@ -37,10 +37,10 @@ settings.register_profile(
 )
 
 SLOWEST = (
-    "test_sweep.py", "test_assist.py", "test_estop.py",
+    "test_study.py", "test_assist.py", "test_estop.py",
     "test_uneven.py", "test_split_program.py", "test_dead_services.py", "test_faults.py",
     "test_squat.py", "test_sim.py", "test_run_log.py", "test_certificate.py",
-    "test_sweep_robust.py", "test_plant.py", "test_sampled_loop.py",
+    "test_robust.py", "test_actuation.py", "test_sampled_loop.py",
 )  # fmt: skip
 """Files begun with, so that none of them is left to one core in the end."""
 

@@ -84,8 +84,6 @@ VENDORS = {
     "matplotlib": [
         "tools/output.py",
         "tools/judge/figure.py",
-        "tools/lab/studies/sweeps/kill.py",
-        "tools/lab/studies/sweeps/latency_report.py",
     ],
     "PIL": ["tools/judge/reports/moving_picture.py"],
     "casadi": [
@@ -152,6 +150,7 @@ TOOL_LAWS = [
     "tools/lab/design/*.py",
     "tools/logs/reexecution/compare.py",
     "tools/logs/reexecution/params.py",
+    "tools/reach.py",
 ]
 
 LAWS = [
@@ -277,7 +276,7 @@ def test_a_room_imports_only_those_below_it(storey: str) -> None:
 
 
 def test_the_design_of_the_gains_knows_the_planners_law_and_no_other_service() -> None:
-    allowed = ("services.planner.", "shared.", "tools.lab.design.")
+    allowed = ("services.planner.", "shared.", "tools.lab.design.", "tools.reach.")
 
     def is_foreign(_: str, i: Import) -> bool:
         return i.top in PACKAGES and not f"{i.full}.".startswith(allowed)
@@ -497,7 +496,7 @@ def test_only_simulations_know_the_centralised_baseline_and_no_robot_file_names_
     assert {file for file in users if not file.startswith("tests/")} == {
         "tools/sim/recorded_lockstep.py",
         "tools/verbs/sim.py",
-        "tools/lab/studies/sweeps/latency_trial.py",
+        "tools/lab/studies/sweeps/latency.py",
     }
     for file in (ROOT / "deploy").rglob("*.toml"):
         assert "centralised" not in file.read_text(encoding="utf-8"), file

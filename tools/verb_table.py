@@ -127,17 +127,15 @@ VERBS: Final = (
         Verb(f"study {name}", about, f"tools.lab.studies.sweeps.{name}")
         for name, about in (
             ("kill", "kill the planner in random poses, under random pushes"),
-            ("heat", "hold a squat until the motors get warm: who falls, who derates under load"),
             ("robust", "draw every error of the plant at once: who falls, and why"),
             ("latency", "compare three controls over bad networks: who falls, who leads"),
             ("push", "find the hardest push by direction, duration, pose and mode"),
-            ("trips", "check that each trip happens where it should, and nowhere else"),
-            ("certificate", "check the sign of K_fail against falls in simulation"),
-            ("dynamics", "search for poses where a motion that should decay grows"),
         )
     ),
     Verb(
-        "study crash", "bring down services, links and drives one after the other, live, and judge"
+        "study crash",
+        "bring down services, links and drives one after the other, live, and judge",
+        "tools.lab.studies.crash.matrix",
     ),
     Verb("hosts files", "write each host's files into a folder, and send nothing", "hosts:files"),
     Verb("hosts update", "send each host its files: robot file, keys, unit", "hosts:update"),

@@ -25,7 +25,7 @@ from shared.robot.trip_table import JOINT_TRIPS
 from tests.lockstep.runs import Run, kill, led_to, push, restart, run, variant
 from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
-from tools.lab.studies.sweeps.push_range import PushRange
+from tools.lab.studies.sweeps.plants import PushRange
 from tools.sim.lockstep import Lockstep
 from tools.sim.network import BASE
 

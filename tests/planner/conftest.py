@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.planner import Planner
 from shared.arrays import Array
 from tests.planner.states import ROBOT, SESSION, closed, shipped_ik, with_law
+from tools.reach import ReachSolver
 
 
 @pytest.fixture(scope="session")
@@ -25,7 +25,7 @@ def averaging() -> Kinematics:
 
 
 @pytest.fixture
-def ik() -> InverseKinematics:
+def ik() -> ReachSolver:
     return shipped_ik()
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from services.planner.law.certificate import Certificate
 from services.planner.law.hocca import Hocca, LawInputs, LawOutput, LawState
-from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainLaw, GainSplit, JointGains, LocalGains
 from services.planner.planner import Planner
@@ -26,6 +25,7 @@ from shared.robot.robot_model import stand_pose
 from tests import messages
 from tests.conftest import ROBOT_FILE
 from tests.planner import oracle
+from tools.reach import ReachSolver
 
 ROBOT = config_file.load(ROBOT_FILE)
 """The shipped robot."""
@@ -69,9 +69,9 @@ def requiring(robot: RobotConfig, **changes: object) -> RobotConfig:
 
 
 @cache
-def shipped_ik() -> InverseKinematics:
+def shipped_ik() -> ReachSolver:
     """Return the shipped robot's inverse kinematics; each test begins by setting its q."""
-    return InverseKinematics(Kinematics(ROBOT), LIMITS)
+    return ReachSolver(Kinematics(ROBOT), LIMITS)
 
 
 def com_height(robot: RobotConfig, height: float) -> float:
@@ -85,7 +85,7 @@ def p_at(robot: RobotConfig, height: float, **parts: float) -> Array:
     return np.array([x, y, com_height(robot, height), roll, pitch, yaw])
 
 
-def at_pose(robot: RobotConfig, ik: InverseKinematics, p: Array, start: Array) -> Array:
+def at_pose(robot: RobotConfig, ik: ReachSolver, p: Array, start: Array) -> Array:
     """Return q (12,) at p, polished until the oracle agrees to 1e-13; asserts it got there."""
     ik.q[:] = start
     for _ in range(3):  # each solve stops at its tolerance; the next goes on from there

@@ -8,12 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from services.planner.law.inverse_kinematics import TOLERANCE, IkEnding, InverseKinematics, describe
+from services.planner.law.inverse_kinematics import TOLERANCE
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
 from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.states import LIMITS, ROBOT, closed, com_height, p_at
+from tools.reach import IkEnding, ReachSolver, describe
 
 KNEES = (3, 9)
 HIGH = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
@@ -26,12 +27,12 @@ def true_residual(q: Array, p_ref: Array) -> float:
     return float(max(np.abs(error).max() for error in errors))
 
 
-def assert_reached(ik: InverseKinematics, p_ref: Array) -> None:
+def assert_reached(ik: ReachSolver, p_ref: Array) -> None:
     assert true_residual(ik.q, p_ref) <= 2 * TOLERANCE, p_ref
     assert_within(ik.q)
 
 
-def counted(monkeypatch: pytest.MonkeyPatch, ik: InverseKinematics) -> list[int]:
+def counted(monkeypatch: pytest.MonkeyPatch, ik: ReachSolver) -> list[int]:
     """Count in the list's only entry how often the kinematics are computed."""
     count, update = [0], ik.kinematics.update
 
@@ -48,7 +49,7 @@ def assert_within(q: Array) -> None:
     assert np.all(q <= LIMITS[:, 1])
 
 
-def test_the_stand_converges_to_any_pose_of_the_workspace(ik: InverseKinematics) -> None:
+def test_the_stand_converges_to_any_pose_of_the_workspace(ik: ReachSolver) -> None:
     """Torso 0.85..1.20 m with every offset; nearer the ends a leg cannot reach them all."""
     rng = np.random.default_rng(11)
     stand = closed(1.188)
@@ -68,7 +69,7 @@ def test_the_stand_converges_to_any_pose_of_the_workspace(ik: InverseKinematics)
 
 
 def test_a_squat_takes_at_most_two_iterations_a_tick_and_as_many_kinematics(
-    ik: InverseKinematics, monkeypatch: pytest.MonkeyPatch
+    ik: ReachSolver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Warm, without a search."""
     ik.q[:] = closed(1.188)
@@ -84,7 +85,7 @@ def test_a_squat_takes_at_most_two_iterations_a_tick_and_as_many_kinematics(
 
 
 def test_out_of_reach_a_tick_computes_the_kinematics_three_times(
-    ik: InverseKinematics, monkeypatch: pytest.MonkeyPatch
+    ik: ReachSolver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The third takes back a step that led nowhere, once it is at a limit."""
     ik.q[:] = closed(0.948)
@@ -96,7 +97,7 @@ def test_out_of_reach_a_tick_computes_the_kinematics_three_times(
 
 
 def test_an_unreachable_pose_keeps_the_limits_is_reported_and_ends_no_worse_than_it_began(
-    ik: InverseKinematics,
+    ik: ReachSolver,
 ) -> None:
     ik.q[:] = closed(1.188)
     at_start = true_residual(ik.q, HIGH)
@@ -107,7 +108,7 @@ def test_an_unreachable_pose_keeps_the_limits_is_reported_and_ends_no_worse_than
     assert true_residual(ik.q, HIGH) <= at_start
 
 
-def test_the_residual_is_true_where_a_limit_stops_the_step(ik: InverseKinematics) -> None:
+def test_the_residual_is_true_where_a_limit_stops_the_step(ik: ReachSolver) -> None:
     """A pose crept beyond the knee's limit must not be reported as reached."""
     ik.q[:] = closed(1.25)
     start = float(oracle.pose(ROBOT, ik.q)[2])
@@ -154,7 +155,7 @@ def reachable(rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
-    ik: InverseKinematics,
+    ik: ReachSolver,
 ) -> None:
     """None of 7 500 such poses failed, each from a random start and from a stand."""
     rng = np.random.default_rng(2024)
@@ -167,7 +168,7 @@ def test_every_reachable_pose_is_reached_from_any_start_inside_the_limits(
             assert_reached(ik, p_ref)
 
 
-def test_a_pose_beyond_the_fold_is_reached_and_reported_so(ik: InverseKinematics) -> None:
+def test_a_pose_beyond_the_fold_is_reached_and_reported_so(ik: ReachSolver) -> None:
     """Made with a left knee twisted by -0.535 rad; every stand ends 0.35 mm short of it."""
     p_ref = np.array([-0.07247, 0.06702, 0.90433, -0.03099, 0.82851, 0.13846])
     ik.q[:] = closed(1.188)
@@ -192,7 +193,7 @@ def p_unreachable(request: pytest.FixtureRequest) -> Array:
 
 
 def test_out_of_reach_it_ends_inside_the_limits_with_legs_that_agree(
-    ik: InverseKinematics, p_unreachable: Array
+    ik: ReachSolver, p_unreachable: Array
 ) -> None:
     rng, misses = np.random.default_rng(3), []
     for start in (rng.uniform(*LIMITS.T), closed(1.188), closed(0.85, pitch=1.0)):
@@ -210,7 +211,7 @@ def test_out_of_reach_it_ends_inside_the_limits_with_legs_that_agree(
 
 
 def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
-    ik: InverseKinematics, p_unreachable: Array
+    ik: ReachSolver, p_unreachable: Array
 ) -> None:
     """By the oracle, to first order: moves of 1 mrad that keep the legs together."""
     ik.q[:] = closed(1.188)
@@ -230,7 +231,7 @@ def test_out_of_reach_no_small_move_of_the_closed_chain_comes_nearer(
         assert nearer <= 2e-6 or np.abs(C @ move).max() > 1e-9
 
 
-def test_out_of_reach_it_gets_no_worse(ik: InverseKinematics) -> None:
+def test_out_of_reach_it_gets_no_worse(ik: ReachSolver) -> None:
     """A start near the best pose there is, where all other starts end 8 mm further away."""
     right, left = [0.1676, 0.1146, -0.5614, -0.5274, 0.3547], [0.0495, 0.0588, -0.2621, -0.9647]
     ik.q[:] = np.array([*right, 1.5819, *left, 0.2394, 2.0868])
@@ -242,7 +243,7 @@ def test_out_of_reach_it_gets_no_worse(ik: InverseKinematics) -> None:
 TOO_HIGH = np.array([0.0, 0.0, 1.31, 0.0, 0.0, 0.0])
 
 
-def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(ik: InverseKinematics) -> None:
+def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(ik: ReachSolver) -> None:
     ik.q[:] = closed(1.188)
     reach = ik.solve_from_anywhere(TOO_HIGH)
     assert reach.outcome is IkEnding.JOINT_LIMIT
@@ -253,14 +254,14 @@ def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(ik: InverseKine
     )
     wide = LIMITS.copy()
     wide[list(KNEES), 1] = 0.3
-    beyond = InverseKinematics(Kinematics(ROBOT), wide)
+    beyond = ReachSolver(Kinematics(ROBOT), wide)
     beyond.q[:] = stand_pose(ROBOT, 1.188)
     reach = beyond.solve_from_anywhere(TOO_HIGH)
     assert (reach.outcome, set(reach.stopped)) == (IkEnding.OUT_OF_REACH, {0}), "straight legs"
     assert describe(reach, TOO_HIGH, wide).endswith("reach no further, no joint is at its limit")
 
 
-def test_a_configuration_on_the_way_is_not_called_the_nearest(ik: InverseKinematics) -> None:
+def test_a_configuration_on_the_way_is_not_called_the_nearest(ik: ReachSolver) -> None:
     ik.q[:] = closed(1.0)
     reach = ik.examine(TOO_HIGH)
     assert reach.outcome is IkEnding.UNFINISHED
@@ -271,9 +272,7 @@ def test_a_configuration_on_the_way_is_not_called_the_nearest(ik: InverseKinemat
     assert (reach.outcome, set(reach.stopped)) == (IkEnding.UNFINISHED, {0})
 
 
-def test_the_same_start_and_pose_give_the_same_bits(
-    ik: InverseKinematics, p_unreachable: Array
-) -> None:
+def test_the_same_start_and_pose_give_the_same_bits(ik: ReachSolver, p_unreachable: Array) -> None:
     ik.q[:] = closed(1.0)
     ik.solve_from_anywhere(p_unreachable)
     first, ik.q[:] = ik.q.copy(), closed(1.0)

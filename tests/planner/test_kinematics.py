@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from shared.arrays import Array
 from shared.config.gain_schedule import inputs_of
@@ -18,6 +17,7 @@ from tests.planner import oracle
 from tests.planner.oracle import LEFT, RIGHT
 from tests.planner.states import ROBOT, SQUAT, WEIGHT, Stand, closed
 from tools.lab.design.push_limit import LoadedStand
+from tools.reach import ReachSolver
 
 POSES = (
     {"height": 1.188},
@@ -279,7 +279,7 @@ def laden() -> RobotConfig:
 @pytest.fixture(scope="module", params=[0.0, 0.6], ids=["upright", "pitched"])
 def laden_q(request: pytest.FixtureRequest, laden: RobotConfig) -> Array:
     """Return a closed stand that leans and turns."""
-    ik = InverseKinematics(Kinematics(laden), np.array(laden.joint_limits()))
+    ik = ReachSolver(Kinematics(laden), np.array(laden.joint_limits()))
     ik.q[:] = stand_pose(laden, 1.0)
     p = np.array([0.02, -0.02, 0.86, 0.05, request.param, 0.06])
     assert ik.solve_from_anywhere(p).converged

@@ -14,13 +14,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from services.planner.law.inverse_kinematics import TOLERANCE, InverseKinematics
+from services.planner.law.inverse_kinematics import TOLERANCE
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainLaw, GainSplit
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from tests.planner import oracle
 from tests.planner.states import LIMITS, ROBOT, WEIGHT, closed, with_law
+from tools.reach import ReachSolver
 
 KNEES = [3, 9]
 OTHERS = [joint for joint in range(12) if joint not in KNEES]
@@ -124,7 +125,7 @@ def test_the_gains_go_through_straight_knees_without_a_jump(path: Path) -> None:
 def test_local_gains_pass_straight_knees_smoothly(leaning: Path, split: str) -> None:
     robot = leaning.robot
     splitting, gain_law = GainSplit(with_law(robot, split=split)), GainLaw(robot)
-    ik = InverseKinematics(Kinematics(robot), LIMITS)
+    ik = ReachSolver(Kinematics(robot), LIMITS)
     local = []
     for q in leaning.q:
         T = per_p(ik, q)
@@ -137,7 +138,7 @@ def test_local_gains_pass_straight_knees_smoothly(leaning: Path, split: str) -> 
         assert np.abs(np.diff(values, axis=0)).max() <= slope * STEP
 
 
-def per_p(ik: InverseKinematics, q: Array) -> Array:
+def per_p(ik: ReachSolver, q: Array) -> Array:
     """Return joint rates per unit of p (12, 6) at q, as the law makes them."""
     ik.q[:] = q
     ik.examine(np.zeros(6))
@@ -146,7 +147,7 @@ def per_p(ik: InverseKinematics, q: Array) -> Array:
 
 def test_rates_never_exceed_the_motion_they_follow(leaning: Path) -> None:
     """The robot led through straight knees: v_ref = T S J v."""
-    ik = InverseKinematics(Kinematics(leaning.robot), LIMITS)
+    ik = ReachSolver(Kinematics(leaning.robot), LIMITS)
     S = np.array(leaning.robot.law.S)
     for before, q, after in zip(leaning.q, leaning.q[1:], leaning.q[2:], strict=False):
         v = (after - before) / (2 * STEP)
@@ -157,7 +158,7 @@ def test_rates_never_exceed_the_motion_they_follow(leaning: Path) -> None:
 
 def test_rates_are_bounded_whatever_is_asked(path: Path) -> None:
     """By the damping: 1 / (2 * 1e-4) per unit of pdot. Undamped, no number bounds them."""
-    ik = InverseKinematics(Kinematics(path.robot), LIMITS)
+    ik = ReachSolver(Kinematics(path.robot), LIMITS)
     largest = max(float(np.linalg.norm(per_p(ik, q), 2)) for q in path.q)
     assert largest <= 5000.0
     at_straight = path.q[100]
@@ -175,7 +176,7 @@ def led(z: float) -> Array:
 
 @pytest.mark.parametrize("beyond", [0.001, 0.01, 0.1])
 def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_no_trace(
-    ik: InverseKinematics, beyond: float
+    ik: ReachSolver, beyond: float
 ) -> None:
     start = closed(1.188)
     low = float(oracle.pose(ROBOT, start)[2])
@@ -209,7 +210,7 @@ def test_with_knees_free_to_straighten_a_height_beyond_is_finite_and_the_least_m
     """With straight knees only the legs' lean from ankle to hip remains."""
     wide = LIMITS.copy()
     wide[KNEES, 1] = 0.1
-    ik = InverseKinematics(Kinematics(ROBOT), wide)
+    ik = ReachSolver(Kinematics(ROBOT), wide)
     ik.q[:] = closed(1.188)
     straight = float(oracle.pose(ROBOT, leaning.q[100])[2])
     for z in np.linspace(0.92, straight + 0.1, 500):

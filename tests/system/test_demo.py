@@ -6,6 +6,7 @@ test_agreement.
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -62,12 +63,10 @@ def test_the_robot_stands_when_a_knees_service_is_killed_in_the_squat(tmp_path: 
     with leaving_nothing():
         done = xrl_led("study crash", tmp_path, "--only", "kill-knee_left")
     assert done.returncode == 0, done.stdout + done.stderr
-    document = json.loads((tmp_path / "results.json").read_text())
-    assert document["complete"] is True
-    (row,) = document["cases"]
-    assert row["verdict"] == "stood"
-    assert row["safe_ms"] is not None
-    assert "kill-knee_left" in (tmp_path / "junit.xml").read_text()
+    with (tmp_path / "cases.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["name"], row["verdict"]) == ("kill-knee_left", "stood")
+    assert row["safe_ms"]
     assert (tmp_path / "kill-knee_left" / "logs" / "knee_left.log").is_file()
 
 

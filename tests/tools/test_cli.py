@@ -228,10 +228,12 @@ def test_a_folder_that_is_gone_or_is_none_is_one_line(
 
 
 def test_workers_without_shared_memory_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    no_locks = Mock(side_effect=OSError(errno.ENOENT, "No such file or directory"))
-    monkeypatch.setattr(pool, "ProcessPoolExecutor", no_locks)
+    def no_locks(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOENT, "No such file or directory")
+
+    monkeypatch.setattr("joblib.Parallel.__call__", no_locks)
     with pytest.raises(RunError, match=r"no worker process can be started: .*/dev/shm"):
-        list(pool.results(str, [1], 1, str))
+        list(pool.results(str, [1, 2], 2, str))
 
 
 def test_a_bug_is_a_traceback_and_neither_a_fall_nor_bad_input(

@@ -170,7 +170,6 @@ REFUSALS: Final = {
     "bench fleet --json /": "name a file in a folder that exists",
     "study kill --n 0": "--n: '0': a whole number from 1",
     "study robust --n 0": "--n: '0': a whole number from 1",
-    "study certificate --n 0": "--n: '0': a whole number from 1",
     "study latency --n 0": "--n: '0': a whole number from 1",
     "study kill --workers 0": "--workers: '0': a whole number from 1",
     "study kill --only -1": "--only: '-1': a whole number from 0",

@@ -1,4 +1,10 @@
-"""The parts of the fleet that `xrl bench` times, each fed with what a recorded squat gave it."""
+"""The parts of the fleet that `xrl bench` times, each fed with what a recorded squat gave it.
+
+A loop that calls a function a thousand times in a row finds its code and data in the cache. In the
+fleet each cycle follows a sleep, and ten processes share two cores: a planner tick of 294 us warm
+cost 568 us live. A cold call sweeps more memory than a core's own cache holds, and sleeps, before;
+that reproduced the live figure. Times are the calling thread's CPU time.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import msgspec
+import numpy as np
 
 from services.joint.drive_manager import DriveAction, DriveManager
 from services.joint.drivers.odrive_can import OdriveCan
@@ -29,7 +36,7 @@ from shared.config.scenarios import Scenario
 from shared.config.sections import CanConfig
 from shared.joints import MODULES
 from shared.mcap_log.writer import RunWriter
-from tools.lab.bench.timing import Repeated
+from tools.lab.bench.table import Figure, Turn
 from tools.sim.lockstep import Lockstep, begin_standing, forget
 from tools.sim.recorded_lockstep import DRAIN_EVERY, RecordedMessages
 
@@ -40,6 +47,41 @@ PIECE_S: Final = 0.5
 BATCH: Final = 64
 """Messages that the recorder takes in one cycle of 12 ms."""
 MODULE: Final = "knee_right"
+
+
+SWEPT_BYTES: Final = 6 << 20
+"""Read and written before each cold call."""
+ASLEEP_S: Final = 1.5e-3
+"""Sleep before each cold call: most of a joint service's cycle."""
+CALLS: Final = {"warm": 200, "cold": 60}
+"""Calls of a turn: a few tenths of a second."""
+YARDSTICK_CALLS: Final = 20
+
+
+class Repeated(NamedTuple):
+    """Something to measure."""
+
+    once: Callable[[], object]
+    """The call that is timed."""
+    before: Callable[[], object] | None = None
+    """Prepares each call, untimed."""
+
+
+def measure(repeated: Repeated, calls: int, *, cold: bool = False) -> float:
+    """Return the median CPU time of a call, us; `cold`: sweep the cache and sleep before each."""
+    once, before = repeated.once, repeated.before
+    swept = np.zeros(SWEPT_BYTES, dtype=np.uint8)
+    times_ns = np.empty(calls)
+    for call in range(calls):
+        if before is not None:
+            before()
+        if cold:
+            np.add(swept, 1, out=swept)
+            time.sleep(ASLEEP_S)
+        begin_ns = time.thread_time_ns()
+        once()
+        times_ns[call] = time.thread_time_ns() - begin_ns
+    return 1e-3 * float(np.median(times_ns))
 
 
 class JointInputs(NamedTuple):
@@ -190,6 +232,18 @@ def recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
     return Repeated(lambda: writer.take_from(outbox, BATCH), before)
 
 
+def yardstick(_recorded: Recorded, _stack: ExitStack) -> Repeated:
+    """`YARDSTICK_CALLS` solutions of a 12 x 12 system: how fast the machine is at this moment."""
+    A = np.eye(12) + 0.01 * np.arange(144.0).reshape(12, 12) / 144.0
+    b = np.ones(12)
+
+    def once() -> None:
+        for _ in range(YARDSTICK_CALLS):
+            np.linalg.solve(A, b)
+
+    return Repeated(once)
+
+
 Prepare = Callable[[Recorded, ExitStack], Repeated]
 
 
@@ -211,10 +265,39 @@ PARTS: Final = (
     Part("joint's drive over CAN", drive_exchange),
     Part("simulator step", simulator_step),
     Part(f"recorder, {BATCH} messages", recorder_batch),
+    Part("yardstick", yardstick),
 )
 
-LOCKSTEP: Final = "lockstep"
-LOCKSTEP_RECORDED: Final = "lockstep with a record"
+LOCKSTEP: Final = {"lockstep": 10.0, "lockstep with a record": 7.0}
+"""Targets of docs/results.md#targets, times real time."""
+FIGURES: Final = (
+    *(
+        Figure(f"{part.name}, {how}", "us", target)
+        for part in PARTS
+        for how, target in (("warm", part.warm_us), ("cold", part.cold_us))
+    ),
+    *(Figure(name, "x", target) for name, target in LOCKSTEP.items()),
+)
+
+
+class Bench:
+    """The parts of a robot, prepared once."""
+
+    def __init__(self, robot: RobotConfig, squat: Scenario, stack: ExitStack) -> None:
+        """Run a squat in virtual time and prepare every part with what it met."""
+        recorded = record(robot, squat)
+        self._parts = {part.name: part.prepare(recorded, stack) for part in PARTS}
+        self._runs = {
+            name: LockstepRun(robot, squat, stack, recorded="record" in name) for name in LOCKSTEP
+        }
+
+    def turn(self) -> Turn:
+        """Return each part's cost, us, and the speeds of lockstep, times real time."""
+        found: Turn = {name: run.speed() for name, run in self._runs.items()}
+        for name, part in self._parts.items():
+            for how, calls in CALLS.items():
+                found[f"{name}, {how}"] = measure(part, calls, cold=how == "cold")
+        return found
 
 
 class LockstepRun:

@@ -4,23 +4,45 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import os
+import signal
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, TypeAlias
 
 from rich import box
+from rich.progress import track
 from rich.table import Table
 from rich.text import Text
 
 from shared.atomic_file import replace_file
-from shared.exceptions import FAULT_EXIT_CODE
+from shared.exceptions import FAULT_EXIT_CODE, RunError
+from shared.places import CHECKOUT, need_checkout
 from tools.flags import Arg, ConfigFlags, Count, Flags, parsed
 from tools.judge.verdict_table import digits
 from tools.terminal import Console, marked
 
-if TYPE_CHECKING:  # it imports all parts of a robot
-    from tools.lab.bench.worker import Answer, Request
+PATIENCE_S: Final = 600.0
+"""Timeout for one turn of another tree, or one run of a fleet."""
+ENDING_S: Final = 30.0
+"""Timeout for an interrupted run to end its fleet."""
+Turn: TypeAlias = dict[str, float | None]
+"""A turn's figures by name; None if it has none."""
+
+
+class Figure(NamedTuple):
+    """One figure of a bench."""
+
+    what: str
+    unit: str
+    """`x`: a speed, which is to be high; anything else is to be low."""
+    target: float | None = None
 
 
 class Row(NamedTuple):
@@ -28,9 +50,8 @@ class Row(NamedTuple):
 
     what: str
     unit: str
-    """`x`: a speed, which is to be high; anything else is to be low."""
     value: float | None
-    """Median of the turns; None: no turn has it."""
+    """Median of the turns; None if no turn has it."""
     spread: tuple[float, float] | None
     """Least and most of the turns."""
     other: float | None = None
@@ -54,18 +75,17 @@ class Row(NamedTuple):
         return marked("{} {:g} {}", ">=" if self.unit == "x" else "<=", self.target, mark)
 
 
-def compared(
-    what: str,
-    unit: str,
-    here: Sequence[float | None],
-    there: Sequence[float | None],
-    target: float | None,
-) -> Row:
-    """Return a figure's row, from this tree's values by turn and the other tree's; None: none."""
-    values = [value for value in here if value is not None]
-    others = [value for value in there if value is not None]
-    pairs = [(a, b) for a, b in zip(here, there, strict=False) if a is not None and b]
-    ratios = [b / a if unit == "x" else a / b for a, b in pairs]
+def row_of(figure: Figure, here: Sequence[Turn], there: Sequence[Turn]) -> Row:
+    """Return a figure's row, from this tree's turns and the other tree's."""
+    what, unit, target = figure
+    pairs = list(zip(here, there, strict=False))
+    ratios = [
+        b / a if unit == "x" else a / b
+        for a, b in ((mine.get(what), other.get(what)) for mine, other in pairs)
+        if a and b
+    ]
+    values = [value for turn in here if (value := turn.get(what)) is not None]
+    others = [value for turn in there if (value := turn.get(what)) is not None]
     return Row(
         what,
         unit,
@@ -75,50 +95,6 @@ def compared(
         ratio=median(ratios) if ratios else None,
         target=target,
     )
-
-
-class PartRow(NamedTuple):
-    """One figure of the bench: CPU time in us, or times real time."""
-
-    row: Row
-    wall: float | None
-    """Its value by the wall's clock; None: CPU time only."""
-    to_yardstick: float
-    """Time in units of the yardstick that ran right before it; a speed's is its inverse."""
-
-
-def row_of(
-    request: Request, turns: Sequence[Answer], others: Sequence[Answer], target: float | None
-) -> PartRow | None:
-    """Return the row of this tree's turns and the other tree's; None if this one lacks the part."""
-    if any(turn.missing for turn in turns):
-        return None
-    walls = [turn.cost.wall.p50 for turn in turns if turn.cost is not None]
-    what = f"{request.name}, {'cold' if request.cold else 'warm'}" if walls else request.name
-    here, there = ([answer.value for answer in answers] for answers in (turns, others))
-    # of a speed, the time of a millisecond
-    times = [value if walls else 1e3 / value for value in here if value]
-    return PartRow(
-        compared(what, "us" if walls else "x", here, there, target),
-        median(walls) if walls else None,
-        median(us / turn.yardstick_us for us, turn in zip(times, turns, strict=True)),
-    )
-
-
-def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], note: str) -> None:
-    """Print cells by heading, those of no heading to the left, and what they mean below them."""
-    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in columns:
-        shown.add_column(heading, justify="right" if heading else "left", no_wrap=True)
-    for row in zip(*columns.values(), strict=True):
-        shown.add_row(*row)
-    console.print(shown)
-    console.print(note, style="dim")
-
-
-def cell(value: float | None, unit: str = "") -> str:
-    """Return a figure with its unit."""
-    return "" if value is None else f"{digits(value)} {unit}".rstrip()
 
 
 def _writable(text: str) -> Path:
@@ -142,23 +118,139 @@ class AgainstFlags(BenchFlags, ConfigFlags):
     """A tree, and one to compare it with."""
 
     against: Annotated[str | None, Arg(metavar="REV")] = None
-    """also measure a git revision, in turn with this tree, and print the ratios; both run in this
-    environment"""
+    """also measure a git revision by its own bench, in turn with this tree, and print the ratios;
+    both run in this environment"""
     strict: Annotated[bool, Arg(help=f"exit code {FAULT_EXIT_CODE} if a target is missed")] = False
 
-    def finish(self, rows: Sequence[Row], more: Iterable[Mapping[str, object]]) -> int:
-        """Write each row, and what more there is of it; return the exit code."""
-        pairs = zip(rows, more, strict=True)
-        write_rows(self.json, [{**row._asdict(), **its} for row, its in pairs])
-        return FAULT_EXIT_CODE if self.strict and not all(row.ok for row in rows) else 0
+
+def run_turns(
+    flags: AgainstFlags,
+    words: Sequence[str],
+    rounds: int,
+    measure: Callable[[], Turn],
+    console: Console,
+) -> tuple[list[Turn], list[Turn]]:
+    """Return the turns of this tree, and of the one of `--against`, which take turns.
+
+    Args:
+        flags: of the verb.
+        words: the verb with its flags, for a tree that runs in a process of its own.
+        rounds: turns of each tree.
+        measure: one turn of this tree.
+        console: for the progress bar.
+    """
+    each = track(range(rounds), "measuring", console=console, transient=True)
+    if flags.against is None:
+        return [measure() for _ in each], []
+    with unpacked(flags.against) as other:
+        pairs = [(turn_of(CHECKOUT, words, flags.config), turn_of(other, words, flags.config))
+                 for _ in each]  # fmt: skip
+    return [here for here, _ in pairs], [there for _, there in pairs]
 
 
-def compared_columns(rows: Sequence[Row], against: str, *, units: bool) -> dict[str, list[str]]:
-    """Return the other revision's figures, and this tree's ratios to them."""
-    return {
-        against: [cell(row.other, row.unit if units else "") for row in rows],
-        "ratio": ["" if row.ratio is None else f"{row.ratio:.2f}" for row in rows],
+def turn_of(tree: Path, words: Sequence[str], config: Path) -> Turn:
+    """Return one turn of a tree's own bench, with its version of a robot file of this checkout."""
+    config = config.resolve()
+    if config.is_relative_to(CHECKOUT):
+        config = tree / config.relative_to(CHECKOUT)
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        run_tree(tree, [*words, "--rounds", "1", "--config", str(config), "--json", file.name])
+        rows = json.loads(Path(file.name).read_bytes())
+    return {row["what"]: row["value"] for row in rows}
+
+
+@contextmanager
+def unpacked(revision: str) -> Iterator[Path]:
+    """Yield a folder with the tree of a git revision.
+
+    Raises:
+        RunError: this is no checkout, git is missing, or it knows no such revision.
+    """
+    need_checkout("--against")
+    with tempfile.TemporaryDirectory(prefix="xrl-bench-") as name:
+        tree, archive = Path(name) / "tree", Path(name) / "tree.tar"
+        words = ["git", "archive", "--format=tar", f"--output={archive}", revision]
+        try:
+            done = subprocess.run(words, check=False, cwd=CHECKOUT, capture_output=True, text=True)
+        except FileNotFoundError:
+            raise RunError("git is missing; --against needs it to read a revision") from None
+        if done.returncode:
+            reason = " ".join(done.stderr.strip().splitlines()[-1:])
+            raise RunError(f"{revision}: no git revision here ({reason}); such as HEAD~1")
+        with tarfile.open(archive) as packed:
+            packed.extractall(tree)  # noqa: S202 - git's own
+        run_module(tree, "tools.graph_libraries", [])  # else CasADi interprets its law
+        yield tree
+
+
+def run_tree(tree: Path, words: Sequence[str]) -> str:
+    """Run `xrl` of a source tree; return its output.
+
+    Raises:
+        RunError: it ended with an error, or not in time.
+    """
+    code, output = run_module(tree, "tools.cli", words)
+    if code:
+        last = " / ".join(output.strip().splitlines()[-3:])
+        raise RunError(f"{tree}: `xrl {words[0]}` ended with {code}: {last}")
+    return output
+
+
+def run_module(tree: Path, module: str, words: Sequence[str]) -> tuple[int, str]:
+    """Run a module of a source tree; return its exit code and output. Ctrl-C reaches it as well."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *words],
+        cwd=tree, env=os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"},
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    try:
+        output = process.communicate(timeout=PATIENCE_S)[0]
+    except (subprocess.TimeoutExpired, KeyboardInterrupt) as error:
+        if isinstance(error, subprocess.TimeoutExpired):
+            process.send_signal(signal.SIGINT)
+        try:
+            process.communicate(timeout=ENDING_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise RunError(f"{tree}: {module} has not ended after {PATIENCE_S:g} s") from None
+    return process.returncode, output
+
+
+def finish(flags: AgainstFlags, rows: Sequence[Row], note: str, console: Console) -> int:
+    """Print and write the rows; return the exit code, with --strict that of a missed target."""
+    columns: dict[str, list[Any]] = {
+        "": [row.what for row in rows],
+        "here": [cell(row.value, row.unit) for row in rows],
     }
+    if flags.against is None:
+        spreads = (() if row.spread is None else map(digits, row.spread) for row in rows)
+        columns["least .. most"] = [" .. ".join(spread) for spread in spreads]
+    else:
+        columns[flags.against] = [cell(row.other, row.unit) for row in rows]
+        columns["ratio"] = ["" if row.ratio is None else f"{row.ratio:.2f}" for row in rows]
+    columns["target"] = [row.marked_target() for row in rows]
+    print_table(console, columns, note)
+    write_rows(flags.json, [row._asdict() for row in rows])
+    return FAULT_EXIT_CODE if flags.strict and not all(row.ok for row in rows) else 0
+
+
+def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], note: str) -> None:
+    """Print cells by heading, those of no heading to the left, and a note below them."""
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in columns:
+        shown.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    for row in zip(*columns.values(), strict=True):
+        shown.add_row(*row)
+    console.print(shown)
+    console.print(note, style="dim")
+
+
+def cell(value: float | None, unit: str = "") -> str:
+    """Return a figure with its unit."""
+    return "" if value is None else f"{digits(value)} {unit}".rstrip()
 
 
 def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:

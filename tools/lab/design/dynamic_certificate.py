@@ -73,11 +73,6 @@ SEEN: Final = (
 """What (phi, theta) a module measures, per (phi, theta): with both motors blind, and with either:
 docs/law.md (3)."""
 
-LADDER: Final = (1.0, 1.41, 2.0, 2.82, 4.0, 5.64, 8.0)
-"""Factors tried on gains, in ascending order."""
-DELAYS: Final = (1.0, 5.0, 10.0, 15.0, 20.0, 24.0)
-"""Multiples of `DELAY_MIN_S`, up to the age at which a command is refused."""
-
 
 class Design(NamedTuple):
     """Gains chosen with this certificate, one set for all poses."""
@@ -149,19 +144,6 @@ class DynamicVerdict(NamedTuple):
         return f"{self.condition.words()}: {what} by {abs(g.rate):.2f}/s at {g.frequency_hz:.1f} Hz"
 
 
-class StabilityMargins(NamedTuple):
-    """Largest factors that keep one drivetrain stable in every condition; 0 if not even 1 does."""
-
-    stiffness: float
-    """N m/rad"""
-    torque: float
-    """On every feedback torque."""
-    coupling: float
-    """On tau_coupled."""
-    delay_s: float
-    """From a sample to the use of its command, s."""
-
-
 def nodes_of(
     config: RobotConfig, D_at: Callable[[float, float], Array], heights: Array, pitches: Array
 ) -> list[StiffnessNode]:
@@ -185,13 +167,9 @@ def nodes_of(
 
 
 def stands_of(config: RobotConfig, poses: Poses, node: PoseNode, M: Array) -> list[Stand]:
-    """Return the last of the poses linearised, without and with the full assist.
+    """Return the last of the poses, a node, linearised without and with the full assist.
 
-    Args:
-        config: the robot.
-        poses: the last of which is the node.
-        node: that pose.
-        M: inertia along p (6, 6) there (`services.planner.law.model.BodyInertia`).
+    M (6, 6) is the inertia along p there (`services.planner.law.model.BodyInertia`).
     """
     J, J_harness = poses.kinematics.J.copy(), poses.kinematics.J_harness.copy()
     S = np.array(config.law.S, float)
@@ -303,41 +281,6 @@ class DynamicCertificate:
         """Return the rate (1/s, negative) of the TRACK oscillation with the slowest decay."""
         cases = self.conditions(TRACK, margins=False)
         return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
-
-    def margins(self, design: Design) -> list[StabilityMargins]:
-        """Return the room that each drivetrain leaves, over all poses, hands and modes."""
-
-        def highest_stable(
-            cases: Sequence[Condition],
-            ladder: Sequence[float],
-            scaled: Callable[[Condition, float], Condition],
-        ) -> float:
-            highest = 0.0
-            for factor in ladder:
-                if not all(self.judge(scaled(case, factor), design).stable for case in cases):
-                    break
-                highest = factor
-            return highest
-
-        rooms = []
-        for stiffness in self._wanted.stiffness:
-            nominal = [
-                c for c in self.conditions(TRACK + HELD, margins=False) if c.stiffness == stiffness
-            ]
-            led = [c for c in nominal if c.mode == "TRACK"]
-            prompt = [c for c in led if c.delay_s == DELAY_MIN_S]
-            rooms.append(
-                StabilityMargins(
-                    stiffness,
-                    highest_stable(nominal, LADDER, lambda c, f: c._replace(gains=Gains(torque=f))),
-                    highest_stable(led, LADDER, lambda c, f: c._replace(gains=Gains(coupling=f))),
-                    DELAY_MIN_S
-                    * highest_stable(
-                        prompt, DELAYS, lambda c, f: c._replace(delay_s=DELAY_MIN_S * f)
-                    ),
-                )
-            )
-        return rooms
 
     def judge(self, condition: Condition, design: Design) -> DynamicVerdict:
         """Return the growth of the loop in a condition, and its excess."""

@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from services.planner.law.inverse_kinematics import InverseKinematics
 from services.planner.law.kinematics import Kinematics
 from services.planner.law.split import GainLaw
 from shared.arrays import Array
@@ -18,6 +17,7 @@ from shared.config.gain_table import Bounds, ModuleBounds
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG, kind_of
 from shared.robot.robot_model import stand_pose
+from tools.reach import ReachSolver
 
 REACH_STEP: Final = 0.005
 """m; resolution of the ends of the height range."""
@@ -58,7 +58,7 @@ class Poses:
         self._config = config
         self.kinematics = Kinematics(config)
         """Updated at the last pose."""
-        self._ik = InverseKinematics(self.kinematics, np.array(config.joint_limits()))
+        self._ik = ReachSolver(self.kinematics, np.array(config.joint_limits()))
         self._gains = GainLaw(config)
         self.F_O: Array = np.zeros(6)
         """The weight (6,), N and N m."""

@@ -407,11 +407,8 @@ class StandAngles(NamedTuple):
 
 def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
     """Return the stand with the torso level and its origin (between the hips) at a height, m."""
-    from services.planner.law.inverse_kinematics import (  # noqa: PLC0415 - takes a second
-        InverseKinematics,
-        describe,
-    )
-    from services.planner.law.kinematics import Kinematics  # noqa: PLC0415
+    from services.planner.law.kinematics import Kinematics  # noqa: PLC0415 - takes a second
+    from tools.reach import ReachSolver, describe  # noqa: PLC0415
 
     longest = robot.geometry.l1 + robot.geometry.l2
     if not 0.0 < height < longest:
@@ -420,7 +417,7 @@ def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
         raise RunError(text + in_mm)
     limits = np.array(robot.joint_limits())
     kinematics = Kinematics(robot)
-    ik = InverseKinematics(kinematics, limits)
+    ik = ReachSolver(kinematics, limits)
     ik.q[:] = stand_pose(robot, height)
     kinematics.update(ik.q)
     p_ref = np.array([0.0, 0.0, kinematics.p[2], 0.0, 0.0, 0.0])

@@ -13,8 +13,6 @@ from rich.table import Table
 from rich.text import Text
 
 from services.planner.law.certificate import Weakest
-from services.planner.law.inverse_kinematics import InverseKinematics
-from services.planner.law.inverse_kinematics import describe as in_words_of_reach
 from services.planner.law.kinematics import Kinematics
 from shared import places
 from shared.arrays import Array
@@ -44,6 +42,8 @@ from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
 from tools.logs.impairment_intervals import impairments
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
+from tools.reach import ReachSolver
+from tools.reach import describe as describe_reach
 from tools.terminal import Console, marked
 
 POSE_MAX: Final = 10.0
@@ -168,11 +168,11 @@ def at_pose(robot: RobotConfig, text: str) -> Array:
     """Return the joint angles (12,), rad, at a pose p given as text."""
     p_ref = parse("--p", text, 6, POSE_MAX, "m and rad")
     limits = np.array(robot.joint_limits())
-    ik = InverseKinematics(Kinematics(robot), limits)
+    ik = ReachSolver(Kinematics(robot), limits)
     ik.q[:] = stand_pose(robot, robot.simulation.stand_height)
     reach = ik.solve_from_anywhere(p_ref)
     if not reach.converged:
-        raise RunError(in_words_of_reach(reach, p_ref, limits))
+        raise RunError(describe_reach(reach, p_ref, limits))
     return ik.q
 
 

@@ -1,10 +1,10 @@
-"""`xrl bench fleet`: figures from records, medians of turns, and a run that is ended with us."""
+"""`xrl bench fleet`: figures from records, medians of turns, and another revision's turns."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +15,15 @@ from shared.bus.messages import JointCommand
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.clock import NS_PER_MS
 from shared.exceptions import RunError
-from shared.places import CHECKOUT, DEFAULT_CONFIG
-from tests.shared.mcap_log.runs import ROBOT, sample, write
+from shared.places import CHECKOUT
+from tests.messages import sample
+from tests.shared.mcap_log.runs import ROBOT, write
 from tests.tools.exit_codes import exit_code
-from tools.lab.bench import fleet, revisions
-from tools.lab.bench.fleet import FIGURES, Turn
+from tools.lab.bench import fleet, table
+from tools.lab.bench.table import Figure, Row, Turn, row_of, run_module, run_tree
 from tools.logs.run_log import read_run
 
 SUMMARY = {"planner_tick_us": {"median": 200.0, "p99": 400.0}, "fleet_cpu_pct": 90.0}
-
-
-def turn(**known: float) -> Turn:
-    return {figure.name: known.get(figure.name) for figure in FIGURES}
 
 
 def cycle(now_ms: float, seq: int) -> CycleTrace:
@@ -56,17 +53,28 @@ def test_an_age_is_that_of_a_leading_command_in_the_cycle_that_took_it(tmp_path:
 
 def test_a_record_without_commands_and_an_older_summary_leave_figures_out() -> None:
     found = fleet.figures(SUMMARY, np.zeros(0))
-    assert found == turn(tick_us=200.0, tick_p99_us=400.0, cpu_pct=90.0)
-    assert fleet.figures({}, np.array([1.0, 2.0, 3.0]))["first_use_ms"] == 2.0
+    known = {name: value for name, value in found.items() if value is not None}
+    assert known == {"tick, median": 200.0, "tick, p99": 400.0, "CPU, all processes": 90.0}
+    aged = fleet.figures({}, np.array([1.0, 2.0, 3.0]))
+    assert aged["age at first use, median"] == 2.0
 
 
-def test_each_figure_has_a_row_and_its_target_holds_for_real_time_only() -> None:
-    slow = [turn(tick_us=301.0)]
-    row, *_, hand, _ = fleet.rows(slow, [turn(hand_n=20.0)], 1.0)
-    assert (row.what, row.value, row.target, row.ok) == ("tick, median", 301.0, 300.0, False)
-    assert (hand.value, hand.spread, hand.other, hand.ratio) == (None, None, 20.0, None)
-    assert hand.ok
-    assert fleet.rows(slow, (), 0.5)[0].ok
+def test_turns_are_compared_one_by_one() -> None:
+    """The machine was half as fast in the second turn: the ratio does not see it."""
+    here: list[Turn] = [{"tick": us} for us in (200.0, 400.0, 210.0)]
+    there: list[Turn] = [{"tick": us} for us in (250.0, 500.0, 300.0)]
+    row = row_of(Figure("tick", "us", 205.0), here, there)
+    assert (row.value, row.spread, row.other) == (210.0, (200.0, 400.0), 300.0)
+    assert row.ratio == pytest.approx(0.8)
+    assert not row.ok
+    assert row_of(Figure("tick", "us"), [{"tick": None}], []) == Row("tick", "us", None, None)
+
+
+def test_a_faster_lockstep_has_a_ratio_below_one_and_meets_a_target_from_above() -> None:
+    row = row_of(Figure("lockstep", "x", 4.0), [{"lockstep": 4.0}], [{"lockstep": 2.0}])
+    assert row == Row("lockstep", "x", 4.0, (4.0, 4.0), other=2.0, ratio=0.5, target=4.0)
+    assert row.ok
+    assert not row._replace(target=4.1).ok
 
 
 @pytest.fixture
@@ -77,40 +85,34 @@ def tree(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def led(tree: Path, program: str) -> Turn:
-    (tree / "tools/cli.py").write_text(program)
-    return fleet.measure(tree, DEFAULT_CONFIG, "squat", 1.0)
-
-
-@pytest.mark.system
 def test_a_run_that_fell_is_an_error_with_its_last_lines(tree: Path) -> None:
     program = "print('Verdict'); print('one'); print('FELL at 3.1 s'); print('files'); exit(1)"
+    (tree / "tools/cli.py").write_text(program)
     with pytest.raises(RunError, match=r"ended with 1: one / FELL at 3\.1 s / files"):
-        led(tree, program)
+        run_tree(tree, ["demo"])
 
 
-@pytest.mark.system
 def test_a_run_that_does_not_end_is_interrupted_and_may_clear_up(
     tree: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fleet, "PATIENCE_S", 2.0)
-    program = """
+    monkeypatch.setattr(table, "PATIENCE_S", 5.0)
+    (tree / "tools/cli.py").write_text("""
 import pathlib, time
 try:
     while True:
         time.sleep(0.05)
 except KeyboardInterrupt:
     pathlib.Path("cleared").touch()
-"""
-    with pytest.raises(RunError, match="has not ended after 2 s"):
-        led(tree, program)
+""")
+    with pytest.raises(RunError, match="has not ended after 5 s"):
+        run_module(tree, "tools.cli", [])
     assert (tree / "cleared").exists()
 
 
 def test_an_unknown_revision_is_refused_by_name_before_a_fleet_starts(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(fleet, "measure", lambda *_: pytest.fail("a fleet was started"))
+    monkeypatch.setattr(table, "run_tree", lambda *_: pytest.fail("a fleet was started"))
     assert exit_code(["bench", "fleet", "--against", "no-such"]) == 2
     assert "no-such: no git revision here" in capsys.readouterr().err
 
@@ -118,28 +120,31 @@ def test_an_unknown_revision_is_refused_by_name_before_a_fleet_starts(
 def test_two_trees_take_turns_and_a_missed_target_is_told_by_the_exit_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
+    (tmp_path / "law.py").write_text("old")
+    identity = ["-c", "user.name=x", "-c", "user.email=x@example.invalid"]
+    for words in (["add", "law.py"], ["commit", "-qm", "one"]):
+        subprocess.run(["git", *identity, *words], cwd=tmp_path, check=True)
     trees: list[Path] = []
 
-    def measure(tree: Path, config: Path, scenario: str, pace: float) -> Turn:
-        assert config == tree / DEFAULT_CONFIG.relative_to(CHECKOUT)
-        assert (scenario, pace) == ("squat", 1.0)
+    def run(tree: Path, words: Sequence[str]) -> str:
         trees.append(tree)
-        return turn(tick_us=350.0 if tree == CHECKOUT else 700.0, hand_n=20.0)
+        assert words[:2] == ["bench", "fleet"]
+        mine = 350.0 if tree == tmp_path else 700.0
+        row = {"what": "tick, median", "value": mine}
+        Path(words[-1]).write_text(json.dumps([row]))
+        return ""
 
-    @contextmanager
-    def unpacked(_revision: str) -> Iterator[Path]:
-        yield tmp_path
-
-    monkeypatch.setattr(fleet, "measure", measure)
-    monkeypatch.setattr(revisions, "unpacked", unpacked)
+    monkeypatch.setattr(table, "CHECKOUT", tmp_path)
+    monkeypatch.setattr(table, "run_tree", run)
+    monkeypatch.setattr(table, "need_checkout", lambda _word: None)
     file = tmp_path / "fleet.json"
-    words = ["bench", "fleet", "--against", "old", "--rounds", "2", "--strict", "--json", file]
-    assert exit_code(words) == 3
-    assert trees == [CHECKOUT, tmp_path] * 2
-    printed = capsys.readouterr().out
-    assert "missed" in printed
-    assert "0.50" in printed
+    words = ["bench", "fleet", "--against", "HEAD", "--rounds", "2", "--strict", "--json"]
+    assert exit_code([*words, file]) == 3
+    assert len(trees) == 4
+    assert trees[0] == trees[2] == tmp_path
+    assert not trees[1].exists(), "the other tree goes afterwards"
+    assert "missed" in capsys.readouterr().out
     row = json.loads(file.read_text())[0]
-    assert (row["figure"], row["value"], row["other"], row["ratio"]) == (
-        "tick, median", 350.0, 700.0, 0.5,
-    )  # fmt: skip
+    assert (row["value"], row["other"], row["ratio"]) == (350.0, 700.0, 0.5)
+    assert tmp_path != CHECKOUT

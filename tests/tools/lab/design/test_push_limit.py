@@ -20,7 +20,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, equivalent_slope, stand_at
-from tools.lab.studies.sweeps.push_range import com_height
+from tools.lab.studies.sweeps.plants import com_height
 
 HEIGHTS = (0.7, 0.8, 0.9)
 STIFF = np.tile([900.0, 1500.0, 900.0, 1500.0, 900.0, 900.0], 2)

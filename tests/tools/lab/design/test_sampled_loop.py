@@ -269,18 +269,6 @@ def test_a_motion_that_hardly_grows_is_a_drift_only_where_the_person_leads(
     assert certificate.judge(condition, design).stable
 
 
-def test_what_is_in_hand_is_at_least_what_was_asked_for(
-    robot: RobotConfig, nodes: list[StiffnessNode], design: Design
-) -> None:
-    wanted = robot.robustness
-    softest = msgspec.structs.replace(wanted, stiffness=wanted.stiffness[:1])
-    certificate = DynamicCertificate(msgspec.structs.replace(robot, robustness=softest), nodes[:2])
-    (room,) = certificate.margins(design)
-    assert room.torque >= wanted.gain_margin
-    assert room.coupling >= wanted.gain_margin
-    assert room.delay_s >= wanted.delay_margin * wanted.delay_ms / 1e3
-
-
 def test_a_blind_module_adds_its_stiffness_along_the_axis_that_still_sees(
     certificate: DynamicCertificate, nodes: list[StiffnessNode], design: Design
 ) -> None:

@@ -122,6 +122,21 @@ def scenario_of(case: CrashCase) -> Scenario:
     )
 
 
+def describe(case: CrashCase) -> str:
+    """Return the actions of a case."""
+    scenario = scenario_of(case)
+    words = [
+        f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill if row.at <= CRASH_S
+    ]
+    words += [f"{row.service} back at {row.at:g} s" for row in scenario.restart if row.at < CRASH_S]
+    if case.triggered_kill is not None:
+        when = f"{case.triggered_kill.after_s:g} s after" if case.triggered_kill.after_s else "as"
+        many = "all modules track" if case.triggered_kill.modules > 1 else "the first module tracks"
+        words.append(f"{case.triggered_kill.service} KILL {when} {many} again")
+    words += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
+    return f"{', '.join(words)}; asked back at {BACK_S:g} s"
+
+
 LIMP: Final = {
     "ankle": (
         CrashVerdict.FELL,

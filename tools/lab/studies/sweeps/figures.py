@@ -1,4 +1,4 @@
-"""What the trials measure alike: which rows count, how a case ends, figures."""
+"""What the studies measure alike: which rows count, how a case ends, figures and their shares."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from shared.bus.traces import SimTruth
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
 from tools.judge.standing import is_tipping
+from tools.lab.studies.sweeps.table import Row
 from tools.sim.lockstep import Watch, forget
 from tools.sim.virtual_services import Record
 
 END_TOLERANCE_S: Final = 0.1
+Z_95: Final = 1.959964
+"""Two-sided 95 % of a normal distribution, in standard deviations."""
 
 
 class Observer(NamedTuple):
-    """Who looks on while a trial runs; by default nobody."""
+    """Callbacks of a run; the default sees nothing."""
 
     record: Record = forget
     """Takes every message."""
@@ -63,7 +66,7 @@ class Ending(StrEnum):
 
 
 class Ended(msgspec.Struct, frozen=True, kw_only=True):
-    """What every outcome says first."""
+    """The first figures of every outcome."""
 
     ending: Ending
     fell_at_s: float | None = None
@@ -81,7 +84,7 @@ EXIT_CODES: Final = {
     Ending.TIPPING: FELL_EXIT_CODE,
     Ending.UNREADY: FAULT_EXIT_CODE,
 }
-"""A robot that tips has as good as fallen."""
+"""A robot that tips counts as fallen."""
 
 
 def worst(codes: Iterable[int]) -> int:
@@ -131,3 +134,24 @@ def step_nm(before: Sequence[float], after: Sequence[float]) -> float:
 def event_steps_nm(events: Iterable[JointEvent]) -> list[float]:
     """Return the step of torque at each change of mode, N m."""
     return [step_nm(event.tau_before, event.tau_after) for event in events]
+
+
+def wilson(hits: int, of: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share that was seen in some trials (E. B. Wilson, 1927).
+
+    It holds for one share: of several intervals, the worst is missed more often than once in 20.
+
+    Args:
+        hits: how often it was so.
+        of: trials, independent of each other; at least 1.
+    """
+    share, z2 = hits / of, Z_95 * Z_95
+    middle = (share + z2 / (2 * of)) / (1.0 + z2 / of)
+    half = Z_95 / (1.0 + z2 / of) * math.sqrt(share * (1.0 - share) / of + z2 / (4 * of * of))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def parted(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """Return the cases that stood to the end, and the others."""
+    standing = [row for row in rows if row["ending"] == Ending.STOOD]
+    return standing, [row for row in rows if row["ending"] != Ending.STOOD]

@@ -1,59 +1,508 @@
-"""`xrl study kill`: the planner killed at random, in random postures and under pushes."""
+"""`xrl study kill`: the planner killed at random, in random postures and under pushes.
+
+A case follows from the seed and its number alone.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+import random
+from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from rich.table import Table
+import msgspec
+import numpy as np
 
+from services.simulator.physics.plant import PlantConfig
+from services.simulator.physics.world import World
+from shared.bus.messages import JointEvent, Message, Mode, PlannerStatus, RunEvent, RunEventKind
+from shared.bus.topics import Topic
+from shared.bus.traces import SimTruth
+from shared.clock import NS_PER_MS
+from shared.config import gain_schedule
+from shared.config.gain_table import GainSchedule
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
-from shared.extras import late
+from shared.config.scenarios import Keyframe, Kill, Push, Scenario
+from shared.extras import require
+from shared.joints import MODULES, SIDES
+from shared.robot.robot_model import stand_pose
 from tools.flags import Count
-from tools.lab.studies.sweeps import kill_trial, plants, push_range, study
-from tools.lab.studies.sweeps.figures import Ending, with_payload
-from tools.lab.studies.sweeps.kill_trial import (
-    PUSHES_MAX,
-    KillCase,
-    KillCases,
-    KillResult,
-    payloads,
+from tools.lab.design import split_program
+from tools.lab.studies.sweeps import plants, pool, study
+from tools.lab.studies.sweeps.figures import (
+    NOBODY,
+    Ended,
+    Ending,
+    Observer,
+    com_max_mm,
+    ending_of,
+    event_steps_nm,
+    operator_peak_n,
+    parted,
+    scalars,
+    sole_tilt_max_rad,
+    with_payload,
 )
-from tools.lab.studies.sweeps.push_range import PushFlags
-from tools.lab.studies.sweeps.report import FALL_COLOUR, parted, show_falls, show_share
-from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Study, StudyRun, bar
+from tools.lab.studies.sweeps.plants import DIGITS, SHARE, PushFlags, PushRange, uniform
+from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun, bar
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import LawFlags
 from tools.output import Picture, new_figure
+from tools.sim.lockstep import Lockstep
+from tools.sim.virtual_services import Record
 from tools.terminal import Console
 
-if TYPE_CHECKING:
-    import matplotlib as mpl
-    from matplotlib import cm, colors, lines, patches
-else:
-    mpl = late("matplotlib")
-    cm = late("matplotlib.cm")
-    colors = late("matplotlib.colors")
-    lines = late("matplotlib.lines")
-    patches = late("matplotlib.patches")
+PAYLOADS: Final = 5
+"""kg, evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""
+HEIGHT: Final = (0.79, 1.2)
+"""m, torso above the ankles: from the crawl to standing."""
+HEIGHT_UPRIGHT: Final = (0.85, 1.2)
+"""m: the person squats, the torso stays upright."""
+PITCH_MAX: Final = 1.2
+"""rad: the crawl's."""
+LIMIT_MARGIN: Final = 0.05
+"""rad that a posture keeps from the joint limits."""
+PACE: Final = (0.8, 1.6)
+"""Times `SPEED`."""
+SPEED: Final = (0.1, 0.24, 40.0)
+"""m/s, rad/s, N/s: mean speeds of the squat (height) and of the crawl (pitch, assist)."""
+LEG_MIN_S: Final = 1.0
+START_S: Final = 0.5
+"""Standing still before the first leg."""
+STILL_S: Final = (0.3, 1.0)
+"""Standing still before the kill, in the cases that are not moving."""
+LET_GO_S: Final = 1.0
+"""At most so long before the kill."""
+PUSH_SHARE: Final = (0.1, 1.0)
+"""Shares of the hardest push that is drawn (`PushRange`)."""
+PUSH_S: Final = 0.3
+PUSHES_MAX: Final = 3
+POSES_MAX: Final = 2
+AFTER_KILL_S: Final = 3.0
+AFTER_PUSH_S: Final = 1.7
+AFTER_LEAD_S: Final = 2.0
+"""How long a case goes on after the kill, the last push and, hand on, the end of the way: an
+operator who leads on against a robot that holds tips it slowly."""
+DELAY_MAX_MS: Final = 20.0
 
-WORST: Final = (
-    ("com_x_max_mm", "COM forward", 1.0, "mm"),
-    ("com_x_min_mm", "COM backward", -1.0, "mm"),
-    ("com_y_max_mm", "COM to the left", 1.0, "mm"),
-    ("com_y_min_mm", "COM to the right", -1.0, "mm"),
-    ("sole_tilt_max_rad", "tilt of a sole", 1.0, "rad"),
-    ("foot_load_min_n", "load on the lighter foot", -1.0, "N"),
-    ("slip_max_mm", "slip of a foot", 1.0, "mm"),
-    ("torque_step_nm", "torque step at the hand-over", 1.0, "N m"),
-    ("hold_ms", "kill to HOLD", 1.0, "ms"),
-    ("operator_peak_before_n", "operator's force before the kill", 1.0, "N"),
+
+class LeadPose(msgspec.Struct, frozen=True):
+    """Where the operator leads."""
+
+    height_m: float
+    pitch_rad: float
+    assist_n: float
+
+
+class KillCase(msgspec.Struct, frozen=True, kw_only=True):
+    """A drawn case. SI units; times are the scenario's."""
+
+    number: int
+    seed: int
+    payload_kg: float
+    poses: tuple[LeadPose, ...]
+    """One or two, led to one after the other from standing."""
+    pace: float
+    moving: bool
+    """True: killed on the way to the last pose; False: after it has been reached."""
+    way_end_s: float
+    """When the operator is at the last pose, with the hand on."""
+    kill_s: float
+    let_go_s: float | None
+    """When the operator takes the hand off; None: never. The rested weight stays."""
+    delay_ms: float
+    pushes: tuple[Push, ...]
+
+    @property
+    def end_s(self) -> float:
+        """When there is nothing more to wait for."""
+        quiet = [push.at + push.duration + AFTER_PUSH_S for push in self.pushes]
+        if self.let_go_s is None:
+            quiet.append(self.way_end_s + AFTER_LEAD_S)
+        return max([self.kill_s + AFTER_KILL_S, *quiet])
+
+    def scenario(self, robot: RobotConfig) -> Scenario:
+        """Return the case as a scenario; the hand that lets go is not in it."""
+        frames = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
+        for pose, (_, end) in zip(self.poses, _legs(robot, self.poses, self.pace), strict=True):
+            frames.append(
+                Keyframe(at=end, height=pose.height_m, pitch=pose.pitch_rad, assist=pose.assist_n)
+            )
+        return Scenario(
+            name=f"kill-{self.seed}-{self.number}",
+            about=f"case {self.number} of `xrl study kill --seed {self.seed}`",
+            duration=self.end_s,
+            keyframe=tuple(frames),
+            kill=(Kill(service="planner", at=self.kill_s),),
+            push=self.pushes,
+        )
+
+    def true_plant(self) -> PlantConfig:
+        """Return the simulated robot: all errors drawn."""
+        return plants.draw(f"kill {self.seed} {self.number}")
+
+
+def payloads(robot: RobotConfig) -> tuple[float, ...]:
+    """Return the payloads that are drawn from, kg."""
+    highest = robot.mass.payload_max
+    return tuple(round(highest * i / (PAYLOADS - 1), DIGITS) for i in range(PAYLOADS))
+
+
+class KillCases:
+    """The cases of a robot."""
+
+    def __init__(self, robot: RobotConfig, push: float = SHARE) -> None:
+        """Take the robot, and up to which share of what it bears it is pushed."""
+        self._robot, self._push = robot, push
+        self._by_payload: dict[float, tuple[RobotConfig, PushRange]] = {}
+
+    def draw(self, seed: int, number: int) -> KillCase:
+        """Return one case; no other case has to be drawn for it."""
+        dice = random.Random(f"kill {seed} {number}")
+        payload = dice.choice(payloads(self._robot))
+        loaded, pushes = self._of(payload)
+        poses = tuple(_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX))))
+        pace = uniform(dice, *PACE)
+        begin, end = _legs(self._robot, poses, pace)[-1]
+        moving = dice.random() < 0.5
+        kill = uniform(dice, *((begin, end) if moving else (end + STILL_S[0], end + STILL_S[1])))
+        hand_off = dice.random() < 0.5
+        at_the_kill = dice.random() < 0.5
+        let_go = None
+        if hand_off:
+            let_go = kill if at_the_kill else uniform(dice, max(0.0, kill - LET_GO_S), kill)
+        return KillCase(
+            number=number,
+            seed=seed,
+            payload_kg=payload,
+            poses=poses,
+            pace=pace,
+            moving=moving,
+            way_end_s=end,
+            kill_s=kill,
+            let_go_s=let_go,
+            delay_ms=uniform(dice, 0.0, DELAY_MAX_MS),
+            pushes=tuple(_draw_pushes(dice, kill, pushes)),
+        )
+
+    def _of(self, payload: float) -> tuple[RobotConfig, PushRange]:
+        if payload not in self._by_payload:
+            loaded = with_payload(self._robot, payload)
+            self._by_payload[payload] = loaded, PushRange(loaded, self._push)
+        return self._by_payload[payload]
+
+
+def _draw_pose(dice: random.Random, robot: RobotConfig) -> LeadPose:
+    """Draw a posture that the legs reach, and the weight rested on it in half of the cases."""
+    while True:
+        upright = dice.random() < 0.5
+        height = uniform(dice, *(HEIGHT_UPRIGHT if upright else HEIGHT))
+        pitch = 0.0 if upright else uniform(dice, 0.0, PITCH_MAX)
+        if reachable(robot, height, pitch):
+            break
+    resting = dice.random() < 0.5
+    return LeadPose(height, pitch, uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0)
+
+
+def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> list[Push]:
+    """Draw pushes around and after the kill, none over another."""
+    count = dice.randint(1, PUSHES_MAX)
+    around = dice.random() < 0.3
+    early, late = (-0.5, 0.05) if around else (0.1, 0.8)
+    at = uniform(dice, kill_s + early, kill_s + late)
+    pushes = []
+    for _ in range(count):
+        pushes.append(drawn_from.draw(dice, PUSH_SHARE, at, PUSH_S))
+        at = uniform(dice, at + PUSH_S + 0.2, at + PUSH_S + 0.9)
+    return pushes
+
+
+def reachable(robot: RobotConfig, height: float, pitch: float) -> bool:
+    """Return True if the legs hold the torso so, COM over the ankles, inside the limits.
+
+    The torso's masses lie at its origin: its pitch moves no COM, only the hips.
+    """
+    pose = list(stand_pose(robot, height))
+    for hip in (5, 11):
+        pose[hip] += pitch
+    return all(
+        low + LIMIT_MARGIN <= angle <= high - LIMIT_MARGIN
+        for angle, (low, high) in zip(pose, robot.joint_limits(), strict=True)
+    )
+
+
+def _legs(
+    robot: RobotConfig, poses: tuple[LeadPose, ...], pace: float
+) -> list[tuple[float, float]]:
+    """Return when the way to each pose begins and ends, s."""
+    legs, t = [], START_S
+    before = LeadPose(robot.simulation.stand_height, 0.0, 0.0)
+    for pose in poses:
+        ways = zip(msgspec.structs.astuple(before), msgspec.structs.astuple(pose), strict=True)
+        times = [abs(b - a) / speed for (a, b), speed in zip(ways, SPEED, strict=True)]
+        legs.append((t, round(t + max(LEG_MIN_S, max(times) / pace), DIGITS)))
+        before, t = pose, legs[-1][1]
+    return legs
+
+
+def row_of(case: KillCase) -> dict[str, object]:
+    """Return every draw by its column; None where there was no such draw."""
+    row = scalars(case) | {"moving": int(case.moving)}
+    for index in range(POSES_MAX):
+        pose = case.poses[index] if index < len(case.poses) else None
+        for key in LeadPose.__struct_fields__:
+            row[f"pose{index + 1}_{key}"] = getattr(pose, key, None)
+    for index in range(PUSHES_MAX):
+        push = case.pushes[index] if index < len(case.pushes) else None
+        row[f"push{index + 1}_at_s"] = push.at if push else None
+        row[f"push{index + 1}_x_n"] = push.force[0] if push else None
+        row[f"push{index + 1}_y_n"] = push.force[1] if push else None
+    return row
+
+
+class KillResult(Ended, frozen=True, kw_only=True):
+    """The figures of a case; None where there is nothing to measure.
+
+    "After" is from the kill on, "before" from the scenario's start to the kill.
+    """
+
+    kill_height_m: float | None = None
+    """Torso, as it was at the kill."""
+    kill_pitch_rad: float | None = None
+    kill_margin: float | None = None
+    """Failsafe certificate of the last commands (docs/law.md#certificate)."""
+    kill_margin_onboard: float | None = None
+    holds_before: int = 0
+    """Drop-outs from TRACK of the busiest module, the planner alive."""
+    operator_peak_before_n: float | None = None
+    """Vertical force of the hand."""
+    com_before_max_mm: float | None = None
+    """Largest horizontal distance of the COM from the middle of the ankles."""
+    hold_ms: float | None = None
+    """From the kill to HOLD, slowest module; None if one held already."""
+    torque_step_nm: float | None = None
+    """Largest step of a joint's torque at the hand-over."""
+    foot_load_min_n: float | None = None
+    """Smallest normal force under either foot, after."""
+    com_x_min_mm: float | None = None
+    com_x_max_mm: float | None = None
+    com_y_min_mm: float | None = None
+    com_y_max_mm: float | None = None
+    com_max_mm: float | None = None
+    roll_max_rad: float | None = None
+    yaw_max_rad: float | None = None
+    sole_tilt_max_rad: float | None = None
+    slip_max_mm: float | None = None
+    """Largest distance of an ankle from its first place, mm."""
+
+
+class KillRecorder:
+    """Collects from the messages what the verdict needs, and passes all of them on."""
+
+    def __init__(self, on_to: Record) -> None:
+        self._on_to = on_to
+        self.kill_ns: int | None = None
+        self.status: PlannerStatus | None = None
+        """The planner's last."""
+        self.fallen = False
+        """From then on nothing counts."""
+
+    def __call__(self, topic: Topic, module: str, message: Message) -> None:
+        """Take a message as the bus would."""
+        if isinstance(message, PlannerStatus) and not self.fallen:
+            self.status = message
+        elif isinstance(message, RunEvent) and message.kind == RunEventKind.KILLED:
+            self.kill_ns = message.t_ns
+        self._on_to(topic, module, message)
+
+
+def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) -> KillResult:
+    """Run a case to its end or to the fall, and measure it.
+
+    The robot has the case's payload and a gain schedule that fits (`robots_of`).
+    """
+    monitor = KillRecorder(observer.record)
+    fleet = Lockstep(
+        robot,
+        case.scenario(robot),
+        Impairment(delay_ms=case.delay_ms),
+        seed=case.number,
+        record=monitor,
+        plant=case.true_plant(),
+    )
+    feet = FootLoads(fleet.world)
+    rows: list[SimTruth] = []
+    loads: list[float] = []
+
+    def let_go_in_time(row: SimTruth) -> None:
+        if case.let_go_s is not None and row.scenario_s >= case.let_go_s:
+            fleet.world.let_go()
+        observer.watch(row)
+
+    for row in observer._replace(watch=let_go_in_time).rows_that_count(fleet.run(), 0.0):
+        rows.append(row)
+        monitor.fallen = row.fallen
+        loads.append(min(feet.read()))
+    return measure(case, rows, loads, fleet.events, monitor, robot)
+
+
+class FootLoads:
+    """The normal force under each foot."""
+
+    def __init__(self, world: World) -> None:
+        """Find the soles."""
+        self._data = world.data
+        self._soles = [world.model.geom(f"sole_{side}").id for side in SIDES]
+
+    def read(self) -> tuple[float, float]:
+        """Return (right, left), N.
+
+        With the model's elliptic friction cones a contact's first constraint force is its
+        normal force.
+        """
+        contact, force = self._data.contact, self._data.efc_force
+        loads = [0.0, 0.0]
+        for (a, b), address in zip(contact.geom, contact.efc_address, strict=True):
+            for foot, sole in enumerate(self._soles):
+                if sole in (a, b) and address >= 0:
+                    loads[foot] += float(force[address])
+        return loads[0], loads[1]
+
+
+def measure(
+    case: KillCase,
+    rows: list[SimTruth],
+    loads: list[float],
+    events: list[tuple[str, JointEvent]],
+    monitor: KillRecorder,
+    robot: RobotConfig,
+) -> KillResult:
+    """Return the figures of a run, by the world since it began and all messages.
+
+    `loads` has for each row the load of the lighter foot, N.
+    """
+    if not rows or rows[0].scenario_s < 0.0:
+        return KillResult(ending=Ending.FELL if rows else Ending.UNREADY)
+    last = rows[-1]
+    events = [row for row in events if row[1].t_ns <= last.t_ns]
+    before = [row for row in rows if row.scenario_s < case.kill_s]
+    figures: dict[str, float] = {}
+    if before:
+        figures["operator_peak_before_n"] = operator_peak_n(before)
+        figures["com_before_max_mm"] = com_max_mm(before)
+    after = [row for row in rows if row.scenario_s >= case.kill_s]
+    if after and monitor.kill_ns is not None:
+        figures |= _after(after) | _handover(events, monitor.kill_ns)
+        figures["foot_load_min_n"] = min(loads[-len(after) :])
+    if monitor.status is not None:
+        figures["kill_margin"] = monitor.status.margin
+        figures["kill_margin_onboard"] = monitor.status.margin_onboard
+    until_ns = monitor.kill_ns if monitor.kill_ns is not None else last.t_ns
+    return KillResult(
+        ending=ending_of(last, case.end_s, robot),
+        fell_at_s=last.scenario_s if last.fallen else None,
+        holds_before=_drop_outs(events, rows[0].t_ns, until_ns),
+        **figures,
+    )
+
+
+def _after(rows: list[SimTruth]) -> dict[str, float]:
+    x, y = 1e3 * np.array([row.over for row in rows]).T
+    return {
+        "kill_height_m": rows[0].torso[2],
+        "kill_pitch_rad": rows[0].angles[1],
+        "com_x_min_mm": float(x.min()),
+        "com_x_max_mm": float(x.max()),
+        "com_y_min_mm": float(y.min()),
+        "com_y_max_mm": float(y.max()),
+        "com_max_mm": com_max_mm(rows),
+        "roll_max_rad": max(abs(row.angles[0]) for row in rows),
+        "yaw_max_rad": max(abs(row.angles[2]) for row in rows),
+        "sole_tilt_max_rad": sole_tilt_max_rad(rows),
+        "slip_max_mm": 1e3 * max(row.feet_slip for row in rows),
+    }
+
+
+def _drop_outs(events: list[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> int:
+    count = dict.fromkeys(MODULES, 0)
+    for module, event in events:
+        count[module] += from_ns <= event.t_ns < to_ns and _into_hold(event)
+    return max(count.values())
+
+
+def _handover(events: list[tuple[str, JointEvent]], kill_ns: int) -> dict[str, float]:
+    late = {m: e for m, e in reversed(events) if e.t_ns >= kill_ns and _into_hold(e)}
+    figures = {}
+    if len(late) == len(MODULES):
+        figures["hold_ms"] = max(event.t_ns - kill_ns for event in late.values()) / NS_PER_MS
+    if late:
+        figures["torque_step_nm"] = max(event_steps_nm(late.values()))
+    return figures
+
+
+def _into_hold(event: JointEvent) -> bool:
+    return event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
+
+
+def robots_of(
+    cases: Sequence[KillCase], robot: RobotConfig, workers: int, console: Console
+) -> list[RobotConfig]:
+    """Return the robot with the payload of each case, and a gain schedule that fits.
+
+    A certified schedule depends on the payload and takes seconds: one for each, over processes.
+
+    Raises:
+        RunError: no local gains meet the certificate with a payload; says which.
+        MissingPackageError: a schedule is missing, and so is CVXPY.
+    """
+    weights = sorted({case.payload_kg for case in cases})
+    ready = {weight: with_payload(robot, weight) for weight in weights}
+    tasks = [weight for weight in weights if needs_schedule(ready[weight])]
+    if tasks:
+        require("design")
+        solved = pool.results(
+            _solve,
+            [ready[weight] for weight in tasks],
+            workers,
+            lambda one: f"gain schedule with a payload of {one.mass.payload:g} kg",
+        )
+        with bar("{task.completed} of {task.total} gain schedules", console) as shown:
+            line = shown.add_task("", total=len(tasks))
+            for loaded, schedule in solved:
+                made = msgspec.structs.replace(loaded, gain_schedule=schedule)
+                ready[loaded.mass.payload] = made
+                shown.update(line, advance=1)
+    return [ready[case.payload_kg] for case in cases]
+
+
+def needs_schedule(robot: RobotConfig) -> bool:
+    """Return True if the robot's gain split uses a schedule and its own does not fit."""
+    return robot.law.split == "certified" and bool(gain_schedule.why_stale(robot))
+
+
+def _solve(robot: RobotConfig) -> GainSchedule:
+    shipped = robot.gain_schedule
+    # damping and coupling hardly depend on the payload, and their search takes minutes
+    design = None if shipped is None else split_program.design_of(shipped)
+    return split_program.solve(robot, design=design, check=False)
+
+
+FIGURES: Final = (
+    ("com_x_max_mm", "COM forward", "mm", 1.0),
+    ("com_x_min_mm", "COM backward", "mm", -1.0),
+    ("com_y_max_mm", "COM to the left", "mm", 1.0),
+    ("com_y_min_mm", "COM to the right", "mm", -1.0),
+    ("sole_tilt_max_rad", "tilt of a sole", "rad", 1.0),
+    ("foot_load_min_n", "load on the lighter foot", "N", -1.0),
+    ("slip_max_mm", "slip of a foot", "mm", 1.0),
+    ("torque_step_nm", "torque step at the hand-over", "N m", 1.0),
+    ("hold_ms", "kill to HOLD", "ms", 1.0),
+    ("operator_peak_before_n", "operator's force before the kill", "N", 1.0),
 )
-"""Column, in words, which sign is worse, unit."""
-
+"""Column, words, unit, and the sign that is worse."""
 
 EXAMPLES: Final = """
 xrl study kill
@@ -63,51 +512,11 @@ xrl study kill --only 137 --seed 1 --out out/case137
 """
 
 
-class KillStudyFlags(AloneFlags, LawFlags, PushFlags):
+class KillStudyFlags(StudyFlags, LawFlags, PushFlags):
     """How many, and which law."""
 
     n: Count = 500
     """cases"""
-
-
-def _robots(
-    cases: Sequence[KillCase], robot: RobotConfig, workers: int, console: Console
-) -> list[RobotConfig]:
-    """Return the robot with the payload of each case, and a gain schedule that fits."""
-    payloads = sorted({case.payload_kg for case in cases})
-    loaded = [with_payload(robot, payload) for payload in payloads]
-    if any(kill_trial.needs_schedule(one) for one in loaded):
-        with bar("{task.completed} of {task.total} gain schedules", console) as shown:
-            line = shown.add_task("", total=None)
-            loaded = kill_trial.prepare(
-                loaded, workers, lambda done, of: shown.update(line, completed=done, total=of)
-            )
-    by_payload = dict(zip(payloads, loaded, strict=True))
-    return [by_payload[case.payload_kg] for case in cases]
-
-
-def _metadata(case: KillCase, command: str) -> dict[str, str]:
-    hand = "hand on" if case.let_go_s is None else f"hand off at {case.let_go_s:g} s"
-    return {"lockstep": f"{command}; delay {case.delay_ms:g} ms, {hand}"}
-
-
-def report(finished: StudyRun) -> None:
-    """Print what came of the study."""
-    rows, console, command = finished.rows, finished.console, finished.command
-    standing, fallen = parted(rows)
-    show_falls(fallen, command, describe, console)
-    if standing:
-        table = Table(title="Worst of those that stood", title_justify="left")
-        for name in ("what", "figure", "case"):
-            table.add_column(name, justify="left" if name == "what" else "right")
-        for column, what, sign, unit in WORST:
-            known = [row for row in standing if row[column] is not None]
-            if known:
-                worst = max(known, key=lambda row: sign * float(row[column]))
-                table.add_row(what, f"{worst[column]:.3g} {unit}", str(worst["number"]))
-        console.print(table)
-        console.print(f"one case alone: {command} --only CASE", style="dim", soft_wrap=True)
-    show_share(len(fallen), len(rows), console)
 
 
 def describe(row: Row) -> str:
@@ -120,171 +529,69 @@ def describe(row: Row) -> str:
         )
     if row["fell_at_s"] is not None:
         words.append(f"fell at {row['fell_at_s']:.2f} s")
-    elif row["ending"] is Ending.FELL:
+    elif row["ending"] == Ending.FELL:
         words.append("fell before the scenario began")
     words.append(f"delay {row['delay_ms']:g} ms")
     hand_off = row["let_go_s"]
     words.append("hand on" if hand_off is None else f"hand off at {hand_off:g} s")
-    assist = row["pose1_assist_n"] if row["pose2_assist_n"] is None else row["pose2_assist_n"]
-    words.append(f"assist to {assist:g} N")
-    pushes = [
-        f"{row[f'push{i}_x_n']:g},{row[f'push{i}_y_n']:g} N at {row[f'push{i}_at_s']:g} s"
-        for i in range(1, PUSHES_MAX + 1)
-        if row[f"push{i}_at_s"] is not None
-    ]
-    words.append("push " + " and ".join(pushes))
-    return ", ".join(words)
+    pushes = [f"{x:g},{y:g} N at {at:g} s" for at, x, y in _pushes(row)]
+    return ", ".join([*words, "push " + " and ".join(pushes)])
+
+
+def _pushes(row: Row) -> list[tuple[float, float, float]]:
+    """Return time, x and y of each push of a row."""
+    columns = ("at_s", "x_n", "y_n")
+    found = [[row[f"push{i}_{name}"] for name in columns] for i in range(1, PUSHES_MAX + 1)]
+    return [(at, x, y) for at, x, y in found if at is not None]
 
 
 def draw(finished: StudyRun) -> Picture:
-    """Draw the study."""
-    flags, rows, robot = finished.flags, finished.rows, finished.robot
-    figure = new_figure(13, 11)
-    norm = _norm(payloads(robot))
-    _draw_pushes(figure.add_subplot(2, 2, 1, projection="polar"), rows, norm)
-    postures = figure.add_subplot(2, 2, 2)
-    points = _points(rows, "kill_height_m", "kill_pitch_rad")
-    _draw(postures, points, norm, "Postures")
-    postures.set(xlabel="torso height at the kill in m", ylabel="torso pitch at the kill in rad")
-    _draw_excursions(figure.add_subplot(2, 2, 3), rows, norm, robot)
-    operator = figure.add_subplot(2, 2, 4)
-    points = _points(rows, "delay_ms", "operator_peak_before_n")
-    _draw(operator, points, norm, "Leading, before the kill")
-    operator.set(xlabel="delay each way in ms", ylabel="operator's peak force in N")
-    operator.set_ylim(bottom=0.0)
-    bar = figure.colorbar(
-        cm.ScalarMappable(norm, _colours()), ax=figure.axes, shrink=0.5, ticks=payloads(robot)
+    """Draw how far the COM went, by the direction of the strongest push."""
+    rows = [row for row in finished.rows if row["com_max_mm"] is not None]
+    standing, fallen = parted(rows)
+    edge = 1.15 * max((row["com_max_mm"] for row in standing), default=100.0)
+    figure = new_figure(8, 8)
+    axis: Any = figure.add_subplot(projection="polar")
+    groups = (
+        ("stood, hand on", [row for row in standing if row["let_go_s"] is None], "o", "#1f5f8b"),
+        ("stood, hand off", [row for row in standing if row["let_go_s"] is not None], ".", "#777"),
+        ("fell (on the edge)", fallen, "x", FALL_COLOUR),
     )
-    bar.set_label("payload in kg")
-    title = f"Planner killed, {len(rows)} random cases, seed {flags.seed}, "
-    title += f"{push_range.describe(flags)}: {len(parted(rows)[1])} fell"
-    figure.suptitle(title, fontsize=13, x=0.01, ha="left")
-    return figure
-
-
-Point = tuple[float, float, Row]
-
-
-def _points(rows: Iterable[Row], x: str, y: str) -> list[Point]:
-    """Return two columns of the cases that have both."""
-    return [(row[x], row[y], row) for row in rows if None not in (row[x], row[y])]
-
-
-def _colours() -> colors.Colormap:
-    """Return the colours of the payload."""
-    return mpl.colormaps["viridis"]
-
-
-def _norm(levels: Sequence[float]) -> colors.BoundaryNorm:
-    """Return a step of colour for each payload."""
-    if len(set(levels)) < len(levels):
-        return colors.BoundaryNorm([-0.5, 0.5], _colours().N)
-    half = (levels[1] - levels[0]) / 2
-    edges = [level - half for level in levels]
-    return colors.BoundaryNorm([*edges, levels[-1] + half], _colours().N)
-
-
-def _draw(axis: Any, points: Sequence[Point], norm: colors.BoundaryNorm, title: str) -> None:
-    """Draw stands as dots coloured by payload (hollow: the hand was off), falls as crosses."""
-    standing = [point for point in points if point[2]["ending"] is Ending.STOOD]
-    for hand_on in (True, False):
-        some = [point for point in standing if (point[2]["let_go_s"] is None) == hand_on]
-        edges = _colours()(norm([row["payload_kg"] for _, _, row in some]))
-        axis.scatter(
-            [x for x, _, _ in some], [y for _, y, _ in some],
-            s=22, facecolors=edges if hand_on else "none", edgecolors=edges, linewidths=1.0,
-        )  # fmt: skip
-    for x, y, row in points:
-        if row["ending"] is not Ending.STOOD:
-            axis.scatter(x, y, marker="x", s=70, color=FALL_COLOUR, linewidths=2.0, zorder=5)
-            axis.annotate(
-                row["number"], (x, y), textcoords="offset points", xytext=(5, 5), fontsize=8,
-                color=FALL_COLOUR,
-            )  # fmt: skip
-    axis.set_title(title)
-    axis.grid(visible=True, lw=0.3)
-
-
-def _draw_pushes(axis: Any, rows: Sequence[Row], norm: colors.BoundaryNorm) -> None:
-    """COM excursion over the direction of the strongest push."""
-    known = [row for row in rows if row["com_max_mm"] is not None]
-    edge = 1.15 * max((row["com_max_mm"] for row in parted(known)[0]), default=100.0)
-    points = [
-        (_strongest_push(row), min(row["com_max_mm"], edge), row) for row in known
-    ]  # a fall goes on the edge
-    title = "COM, largest distance after the kill in mm,\nby direction of the strongest push"
-    _draw(axis, points, norm, title)
+    for label, some, marker, colour in groups:
+        strongest = [max(_pushes(row), key=lambda push: math.hypot(*push[1:])) for row in some]
+        angles = [math.atan2(y, x) for _, x, y in strongest]
+        distances = [min(row["com_max_mm"], edge) for row in some]
+        axis.scatter(angles, distances, marker=marker, color=colour, label=label)
+    for row in fallen:
+        _, x, y = max(_pushes(row), key=lambda push: math.hypot(*push[1:]))
+        axis.annotate(row["number"], (math.atan2(y, x), edge), color=FALL_COLOUR, fontsize=8)
     axis.set_rlim(0.0, 1.05 * edge)
     axis.set_theta_zero_location("N")  # forward is up, left is left
-    axis.set_xticks(
-        [0.0, math.pi / 2, math.pi, 3 * math.pi / 2], ["forward", "left", "back", "right"]
+    axis.set_thetagrids((0, 90, 180, 270), ("forward", "left", "back", "right"))
+    axis.set_title("COM, largest distance after the kill in mm, by direction of the strongest push")
+    axis.legend(loc="lower left", bbox_to_anchor=(-0.1, -0.1), fontsize=8)
+    pushed = plants.describe(finished.flags)
+    figure.suptitle(
+        f"Planner killed, {len(rows)} cases, seed {finished.flags.seed}, {pushed}: "
+        f"{len(fallen)} fell",
+        x=0.01,
+        ha="left",
     )
-    styles: Sequence[Any] = (
-        ("stood, hand on", "o", "full", "#555555"),
-        ("stood, hand off", "o", "none", "#555555"),
-        ("fell (on the edge), with its number", "x", "full", FALL_COLOUR),
-    )
-    handles = [
-        lines.Line2D([], [], ls="", marker=marker, fillstyle=fill, color=colour, label=words)
-        for words, marker, fill, colour in styles
-    ]
-    axis.legend(handles=handles, loc="lower left", bbox_to_anchor=(-0.3, -0.12), fontsize=8)
-
-
-def _strongest_push(row: Row) -> float:
-    """Return the direction of the strongest push, rad from x to y."""
-    pushes = [(row[f"push{i}_x_n"], row[f"push{i}_y_n"]) for i in range(1, PUSHES_MAX + 1)]
-    x, y = max((push for push in pushes if None not in push), key=lambda push: math.hypot(*push))
-    return math.atan2(y, x)
-
-
-def _draw_excursions(
-    axis: Any, rows: Sequence[Row], norm: colors.BoundaryNorm, robot: RobotConfig
-) -> None:
-    """Where the COM went furthest, over the soles."""
-    points = [
-        (
-            max(row["com_y_min_mm"], row["com_y_max_mm"], key=abs),
-            max(row["com_x_min_mm"], row["com_x_max_mm"], key=abs),
-            row,
-        )
-        for row in rows
-        if row["com_max_mm"] is not None
-    ]
-    _draw(axis, points, norm, "COM, largest way along x and y after the kill")
-    geometry = robot.geometry
-    length, width, base = (1e3 * v for v in (geometry.l_foot, geometry.w_foot, geometry.w_base))
-    outer = (base + width) / 2
-    axis.add_patch(
-        patches.Rectangle(
-            (-outer, -length / 2), 2 * outer, length, fill=False, ls="--", color="#777777"
-        )
-    )
-    axis.annotate(
-        "edge of the support", (0.02, length / 2), xycoords=("axes fraction", "data"),
-        textcoords="offset points", xytext=(0, 3), fontsize=8, color="#777777",
-    )  # fmt: skip
-    stood = [abs(y) for y, _, row in points if row["ending"] is Ending.STOOD]
-    limit_y = min(1.15 * max(stood, default=60.0), 1.1 * outer)
-    axis.set_xlim(limit_y, -limit_y)
-    axis.set_ylim(-length * 0.6, length * 0.6)
-    axis.set(xlabel="COM y in mm, left is left", ylabel="COM x in mm")
+    return figure
 
 
 STUDY: Final = Study[KillCase](
     name="kill",
     table="cases.csv",
-    pictures={"cases.png": draw},
     load=experiment.make_robot,
     cases=lambda flags, robot: partial(KillCases(robot, flags.push).draw, flags.seed),
-    decided_by=("seed", "push"),
-    inputs=lambda _flags: {"ranges": plants.digest()},
-    row=kill_trial.row_of,
+    decided_by=("push",),
+    row=row_of,
     figures=KillResult,
-    trial=kill_trial.run_case,
-    robots=_robots,
-    log=CaseLog(kill_trial.scenario_of, kill_trial.plant_of, _metadata),
-    report=report,
+    trial=run_case,
+    robots=robots_of,
+    report=partial(study.show_outcome, figures=FIGURES, describe=describe),
+    draw=draw,
 )
 
 

@@ -1,4 +1,4 @@
-"""Random plants for the sweeps: every error of `deploy/plants/ranges.toml`, drawn together."""
+"""What the studies draw: plants, with every error of `deploy/plants/ranges.toml`, and pushes."""
 
 from __future__ import annotations
 
@@ -7,18 +7,28 @@ import math
 import random
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
 from services.simulator.physics.plant import PlantConfig, changed
-from shared.exceptions import ConfigError
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Push
+from shared.exceptions import ConfigError, RunError
 from shared.places import FILES
-from shared.toml_file import Section, read_toml
+from shared.toml_file import Range, Section, read_toml
+from tools.flags import Arg, Flags
+from tools.lab.design.poses import Poses
+from tools.lab.design.push_limit import stand_at
 
 RANGES_FILE: Final = FILES / "plants" / "ranges.toml"
 LEAST_SHARE: Final = 0.5
 """Fraction of a range's low end below which a wider draw does not go."""
+DIGITS: Final = 3
+REACHED_M: Final = 1e-4
+SHARE: Final = 0.75
+"""Default of --push: the largest push as a fraction of the limit."""
+SHARE_MAX: Final = 3.0
 
 
 class ErrorRange(Section, frozen=True):
@@ -102,3 +112,77 @@ def _drawn(dice: random.Random, row: ErrorRange, beyond: float) -> float:
     if row.low >= 0.0:  # what cannot be negative, or nothing, comes no nearer to it than this
         value = max(LEAST_SHARE * row.low, value)
     return float(f"{value:.6g}")
+
+
+class PushRange:
+    """The hardest push that a standing robot bears for ever, by direction.
+
+    It is the physical limit (`LoadedStand.limit_of_body`), whatever the control. Forwards and back
+    it is least in the stand; sideways squat and crawl differ from it by less than a quarter.
+    The shipped robot's: 76 to 158 N.
+    """
+
+    def __init__(self, robot: RobotConfig, most: float = SHARE) -> None:
+        """Stand the robot of a file on a level floor; `draw` goes up to `most` of the limit."""
+        poses = Poses(robot)
+        height = robot.simulation.stand_height
+        z = com_height(poses, height, 0.0)
+        stand = stand_at(robot, poses, z, 0.0)
+        if stand is None:
+            raise RunError(f"a stand with the torso at {height:g} m: this robot does not reach it")
+        self._most = most
+        self._stand = stand
+
+    def limit_n(self, angle: float) -> float:
+        """Return the limit, N, along an angle, rad from x (forwards) to y (left)."""
+        return self._stand.limit_of_body((math.cos(angle), math.sin(angle))).force_n
+
+    def push(self, at: float, duration: float, share: float, angle: float) -> Push:
+        """Return a push of a share of the limit along an angle as for `limit_n`."""
+        force = share * self.limit_n(angle)
+        x, y = (round(force * axis, DIGITS) for axis in (math.cos(angle), math.sin(angle)))
+        return Push(at=round(at, DIGITS), duration=duration, force=(x, y, 0.0))
+
+    def draw(
+        self, dice: random.Random, shares: tuple[float, float], at: float, duration: float
+    ) -> Push:
+        """Return a push in any direction, of a share between the two of the hardest drawn."""
+        share, angle = self._most * dice.uniform(*shares), dice.uniform(-math.pi, math.pi)
+        return self.push(at, duration, share, angle)
+
+
+def uniform(dice: random.Random, low: float, high: float) -> float:
+    """Return a number that a table holds exactly as it was drawn."""
+    return round(dice.uniform(low, high), DIGITS)
+
+
+class PushFlags(Flags):
+    """How hard a study pushes."""
+
+    push: Annotated[
+        float,
+        Range(1e-3, SHARE_MAX, ""),
+        Arg(
+            metavar="SHARE",
+            help="push up to this share of what soles and motors bear, standing, in each "
+            "direction: 1 is 76 N forwards and 158 N sideways of the shipped robot",
+        ),
+    ] = SHARE
+
+
+def describe(flags: PushFlags) -> str:
+    """Return how hard a study pushes, for its picture."""
+    return f"pushed with up to {flags.push:.0%} of what soles and motors bear"
+
+
+def com_height(poses: Poses, torso: float, pitch: float) -> float:
+    """Return the COM height, m, at which the torso's origin is `torso` high, by bisection."""
+    low, high = poses.reach()
+    while high - low > REACHED_M:
+        z = 0.5 * (low + high)
+        found = poses.node(z, pitch)
+        if found is None or poses.kinematics.r_torso[2] > torso:
+            high = z
+        else:
+            low = z
+    return low

@@ -1,68 +1,82 @@
-"""Work spread over processes of this machine, or over the workers of a Dask cluster that is there.
+"""Work spread by joblib over processes of this machine, or over the workers of a Dask cluster.
 
-Processes are spawned, one per core by default, and none is left behind: they leave Ctrl-C to the
-process that started them, and end when it does, whatever ended it. Dask is not among the packages
-of the runtime: the extra `cluster` brings it. Its workers run this project's own code, so each
-compares it with the study's before its first task.
+A cluster with a single worker is not used: joblib then runs the cases here. No process is left
+behind: a worker leaves Ctrl-C to the process that started it, and ends when that
+process does. A cluster's workers run this project's own code, so each compares it with the study's.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import importlib.util
 import logging
-import multiprocessing
 import os
+import select
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, as_completed
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from functools import lru_cache, partial
+from contextlib import closing, contextmanager, suppress
+from functools import cache, partial
 from threading import Lock, Thread
-from typing import Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from shared.exceptions import FAULT_EXIT_CODE, RunError, os_error_in_words
-from shared.extras import require
-from tools.lab.studies.sweeps.table import code_digest
+from shared.extras import late, require
+from shared.places import CHECKOUT
+
+if TYPE_CHECKING:
+    import joblib
+else:
+    joblib = late("joblib")
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 CONNECT_S: Final = 10.0
-"""The scheduler has so long to answer."""
-WORKERS_S: Final = 60.0
-"""The first worker has so long to be there, once there is work."""
+"""Timeout for the scheduler's first answer."""
+WORKERS_S: Final = 60
+"""Timeout for the first worker of a cluster."""
+CODE: Final = ("services", "shared", "tools/lab", "tools/sim")
+"""Folders whose code decides how a case comes out."""
 
 _one_at_a_time: Final = Lock()
 """A worker with several threads runs one case after the other: CasADi builds its graphs in one
 thread only."""
 
 
-class Cluster(NamedTuple):
-    """A Dask cluster."""
+class _Done(NamedTuple):
+    """Result of one task, or its error in words."""
 
-    address: str
-    """The scheduler's: tcp://HOST:PORT, or dask://HOST:PORT."""
-    code: tuple[str, ...]
-    """Files that decide a result (`code_digest`): the workers must have the same."""
-
-
-class _Opened(NamedTuple):
-    """Who works."""
-
-    executor: Executor
-    wait_for_a_worker: Callable[[], None]
-    lost: str
-    """What it means when a result is lost."""
+    number: int
+    result: Any
+    error: str = ""
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0))
+    """Return the number of worker processes to use: one a core, or one without joblib."""
+    has_joblib = importlib.util.find_spec("joblib") is not None
+    return len(os.sched_getaffinity(0)) if has_joblib else 1
+
+
+@cache
+def code_digest() -> str:
+    """Return the SHA-256 of the code that decides how a case comes out."""
+    digest = hashlib.sha256()
+    for folder in CODE:
+        for path in sorted((CHECKOUT / folder).rglob("*.py")):
+            digest.update(path.relative_to(CHECKOUT).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def results(
-    work: Callable[[T], R], tasks: Sequence[T], workers: int | Cluster, name: Callable[[T], str]
+    work: Callable[[T], R],
+    tasks: Sequence[T],
+    workers: int,
+    name: Callable[[T], str],
+    cluster: str | None = None,
 ) -> Iterator[tuple[T, R]]:
     """Yield each task with its result as it is done, in no order.
 
@@ -71,131 +85,109 @@ def results(
     Args:
         work: a function of a module; it runs in the workers.
         tasks: its arguments, one after the other.
-        workers: processes, at least 1; or the cluster.
+        workers: processes of this machine; 1: this process.
         name: returns a task's name for an error.
+        cluster: address of a Dask scheduler, whose workers then run the tasks.
 
     Raises:
         RunError: no worker can be started or reached, the work failed on a task, a worker died, or
             a cluster's worker has other code.
     """
-    if not tasks:
+    run = partial(_run, work, "" if cluster is None else code_digest())
+    if workers == 1 and cluster is None:
+        outputs = (run(number, task) for number, task in enumerate(tasks))
+        yield from _unpacked(outputs, tasks, name)
         return
-    if isinstance(workers, Cluster):
-        digest = code_digest(workers.code)
-        work = partial(checked, work=work, code=workers.code, digest=digest)
-        opened = _cluster(workers.address)
-    else:
-        opened = _processes(min(workers, len(tasks)))
-    with opened as (executor, wait_for_a_worker, lost):
-        task_of = {executor.submit(work, task): task for task in tasks}
-        wait_for_a_worker()
-        for future in as_completed(task_of):
-            task = task_of.pop(future)
-            try:
-                result = future.result()
-            except (BrokenProcessPool, CancelledError):
-                raise RunError(lost) from None
-            except Exception as error:
-                words = " ".join(str(error).split())
-                raise RunError(f"{name(task)}: {type(error).__name__}: {words}") from error
-            yield task, result
+    lost = "a worker process was killed (out of memory?); it may need fewer --workers"
+    if cluster is not None:
+        lost = f"--cluster {cluster}: connection to the scheduler lost"
+    with _processes(workers) if cluster is None else _cluster(cluster):
+        parallel = joblib.Parallel(n_jobs=-1 if cluster else min(workers, len(tasks)),
+                                   batch_size=1, return_as="generator_unordered")  # fmt: skip
+        try:
+            warnings.filterwarnings("ignore", module="joblib")  # that cancelled tasks are lost
+            calls = (joblib.delayed(run)(number, task) for number, task in enumerate(tasks))
+            with closing(parallel(calls)) as outputs:
+                yield from _unpacked(outputs, tasks, name)
+        except (BrokenProcessPool, CancelledError):
+            raise RunError(lost) from None
+        except TimeoutError:
+            raise RunError(
+                f"--cluster {cluster}: the scheduler has no workers; start some with "
+                f"`dask worker {cluster} --nthreads 1`"
+            ) from None
+
+
+def _unpacked(
+    outputs: Iterable[_Done], tasks: Sequence[T], name: Callable[[T], str]
+) -> Iterator[tuple[T, Any]]:
+    for done in outputs:
+        if done.error:
+            raise RunError(f"{name(tasks[done.number])}: {done.error}")
+        yield tasks[done.number], done.result
+
+
+def _run(work: Callable[[T], R], digest: str, number: int, task: T) -> _Done:
+    """Do the work in a worker; `digest` is that of the study's code, if the code may differ."""
+    if digest not in ("", code_digest()):
+        return _Done(number, None, "a worker of the cluster has other code; install the same")
+    try:
+        with _one_at_a_time:
+            return _Done(number, work(task))
+    except Exception as error:  # noqa: BLE001 - the study reports it with the task's name
+        words = " ".join(str(error).split())
+        return _Done(number, None, f"{type(error).__name__}: {words}")
 
 
 @contextmanager
-def _processes(workers: int) -> Iterator[_Opened]:
-    before = set(multiprocessing.active_children())
+def _processes(workers: int) -> Iterator[None]:
+    """Run tasks in processes of this machine; end them afterwards."""
+    loky = importlib.import_module("joblib.externals.loky")
     try:
-        executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin)
-    except OSError as error:  # their locks are files in shared memory
+        with joblib.parallel_config("loky", n_jobs=workers, inner_max_num_threads=1,
+                                    initializer=_begin, initargs=(os.getpid(),)):  # fmt: skip
+            yield
+    except OSError as error:  # loky's locks are files in shared memory
         words = os_error_in_words(error)
         raise RunError(f"no worker process can be started: {words}; is /dev/shm there?") from None
-    try:
-        lost = "a worker process was killed (out of memory?); it may need fewer --workers"
-        yield _Opened(executor, lambda: None, lost)
-    except BaseException:
-        for process in set(multiprocessing.active_children()) - before:
-            process.terminate()
-        raise
     finally:
-        executor.shutdown(cancel_futures=True)
+        loky.get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
-def _begin() -> None:
+def _begin(parent: int) -> None:
     """Prepare a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    Thread(target=_follow_parent, daemon=True).start()
+    Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
-def _follow_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(FAULT_EXIT_CODE)
+def _end_with(parent: int) -> None:
+    """End this process when its parent ends, whatever ended the parent."""
+    with suppress(ProcessLookupError):  # it has ended already
+        select.select([os.pidfd_open(parent)], [], [])
+    os._exit(FAULT_EXIT_CODE)
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[_Opened]:
+def _cluster(address: str) -> Iterator[None]:
+    """Run tasks on a Dask cluster; Dask's own log lines stay silent, errors are raised here."""
     scheme, _, place = address.partition("://")
-    if scheme not in ("tcp", "tls", "dask") or ":" not in place:
+    if scheme not in ("tcp", "tls") or ":" not in place:
         raise RunError(f"--cluster {address}: write tcp://HOST:PORT of a Dask scheduler")
-    place = f"tcp://{place}" if scheme == "dask" else address
     require("cluster", "leave --cluster")
     dask = importlib.import_module("distributed")
-    with _silent():
-        try:
-            client = dask.Client(place, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, TimeoutError):
-            raise RunError(
-                f"--cluster {place}: no Dask scheduler answers there; start one with "
-                "`dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`"
-            ) from None
-        executor = client.get_executor(pure=False)  # what is asked for again is run again
-
-        def wait_for_a_worker() -> None:
-            try:
-                client.wait_for_workers(1, timeout=WORKERS_S)
-            except TimeoutError:
-                raise RunError(
-                    f"--cluster {place}: the scheduler has no workers; start some with "
-                    f"`dask worker {place} --nthreads 1`"
-                ) from None
-
-        try:
-            lost = f"--cluster {place}: connection to the scheduler lost"
-            yield _Opened(executor, wait_for_a_worker, lost)
-        finally:
-            executor.shutdown(wait=False)  # cancels what is left
-            client.close()
-
-
-def checked(task: T, work: Callable[[T], R], code: tuple[str, ...], digest: str) -> R:
-    """Do the work in a cluster's worker.
-
-    Raises:
-        RunError: this worker's code is not the study's.
-    """
-    if _digest_here(code) != digest:
-        raise RunError("a worker of the cluster has other code than this study; install the same")
-    with _one_at_a_time:
-        return work(task)
-
-
-@lru_cache
-def _digest_here(code: tuple[str, ...]) -> str:
-    return code_digest(code)
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Keep Dask from logging: what goes wrong is an error here, and said in one line."""
-    names = [name for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
-    loggers = [logging.getLogger(name) for name in ("distributed", *names)]
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL + 1)
+    logging.disable(logging.CRITICAL)
     try:
-        yield
+        client = dask.Client(address, timeout=CONNECT_S, set_as_default=False)
+        try:
+            with joblib.parallel_config("dask", client=client, wait_for_workers_timeout=WORKERS_S):
+                yield
+        finally:
+            client.close()
+    except (OSError, TimeoutError):
+        raise RunError(
+            f"--cluster {address}: no Dask scheduler answers there; start one with "
+            "`dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`"
+        ) from None
     finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
+        logging.disable(logging.NOTSET)

@@ -1,4 +1,8 @@
-"""`xrl study push`: the hardest push by direction, duration, pose and mode."""
+"""`xrl study push`: the hardest push by direction, duration, pose and mode, found by bisection.
+
+The robot is stood up, led to the pose and, if the planner is to be dead, left by it. Each push
+begins from that same moment.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +12,157 @@ from itertools import product
 from typing import Annotated, Any, Final
 
 import msgspec
-from rich.table import Table as Printed
+from rich.table import Table
 
-from services.simulator.physics import plant as plants
-from services.simulator.physics.plant import plant_from
+from services.planner.law.split import ScheduledGains
+from services.simulator.physics.plant import PlantConfig, plant_from
+from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Kill, Push, Scenario
+from shared.exceptions import RunError
 from tools.flags import Arg, Degrees, Duration
-from tools.lab.studies.sweeps import push_trial, study
-from tools.lab.studies.sweeps.push_trial import MODES, POSES, PushResult, PushTrial
-from tools.lab.studies.sweeps.report import FALL_COLOUR
-from tools.lab.studies.sweeps.study import Study, StudyFlags, StudyRun
+from tools.lab.design.poses import Poses
+from tools.lab.design.push_limit import PushLimits, limits_along, stand_at
+from tools.lab.studies.sweeps import study
+from tools.lab.studies.sweeps.figures import NOBODY, Ending, Observer, ending_of
+from tools.lab.studies.sweeps.plants import com_height
+from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live.experiment import PlantFlags
 from tools.output import Picture, new_figure
+from tools.sim.lockstep import FleetMoment, Lockstep
+from tools.sim.network import BASE
+
+POSES: Final = {"stand": (1.188, 0.0), "squat": (0.95, 0.0), "crawl": (0.79, 1.2)}
+"""Torso height, m, and pitch, rad."""
+MODES: Final = ("led", "dead")
+"""While the planner leads, and with the planner dead."""
+REACHED_S: Final = 2.5
+"""Scenario time at which the pose is reached."""
+LEFT_S: Final = 3.5
+"""Scenario time of the planner's kill."""
+BEGIN_S: Final = 4.5
+"""Scenario time at which the push begins."""
+REST_S: Final = 2.0
+"""So long after the push a robot that is to fall has fallen, or is tipping."""
+FORCE_MAX_N: Final = 240.0
+STEP_N: Final = 5.0
+
+
+class PushTrial(msgspec.Struct, frozen=True):
+    """A point of the envelope."""
+
+    number: int
+    pose: str
+    angle_deg: int
+    """Direction of the push: 0 forwards, 90 to the left."""
+    duration_s: float
+    mode: str
+    plant: PlantConfig = PlantConfig()
+
+    def scenario(self, _robot: RobotConfig, force_n: float = 0.0) -> Scenario:
+        """Return what happens for a push of this force."""
+        height, pitch = POSES[self.pose]
+        angle = math.radians(self.angle_deg)
+        push = Push(
+            at=BEGIN_S,
+            duration=self.duration_s,
+            force=(force_n * math.cos(angle), force_n * math.sin(angle), 0.0),
+        )
+        return Scenario(
+            name=f"push-{self.number}",
+            about=f"{self.pose}, {self.mode}, {force_n:g} N at {self.angle_deg} degrees",
+            duration=BEGIN_S + self.duration_s + REST_S,
+            keyframe=(
+                Keyframe(at=0.0, height=POSES["stand"][0]),
+                Keyframe(at=REACHED_S, height=height, pitch=pitch),
+            ),
+            kill=(Kill(service="planner", at=LEFT_S),) if self.mode == "dead" else (),
+            push=(push,) if force_n > 0.0 else (),
+        )
+
+    def true_plant(self) -> PlantConfig:
+        """Return the simulated robot."""
+        return self.plant
+
+
+class PushResult(msgspec.Struct, frozen=True, kw_only=True):
+    """How hard a push is stood."""
+
+    stood_n: float
+    """The hardest that it stood, N; 0 if none."""
+    fell_n: float | None
+    """The lightest that it fell at, within `STEP_N` of it; None: it stood them all."""
+    held_limit_n: float
+    """What its gains bear if the push lasts (`tools.lab.design.push_limit`): HOLD's, into which a
+    led robot trips but for a push straight forwards or back."""
+    held_part: str
+    """What gives way then."""
+    body_limit_n: float
+    """What soles and motors bear in this pose if the push lasts, whatever the control."""
+
+
+def run_trial(trial: PushTrial, robot: RobotConfig, _observer: Observer = NOBODY) -> PushResult:
+    """Find the hardest push by bisection.
+
+    Raises:
+        RunError: the robot does not come to the pose.
+    """
+    start = _start_of(trial, robot)
+    stood, fell = 0.0, FORCE_MAX_N + STEP_N
+    while fell - stood > STEP_N:
+        force = STEP_N * round(0.5 * (stood + fell) / STEP_N)
+        if _stands(trial, robot, start, force):
+            stood = force
+        else:
+            fell = force
+    limits = limits_of(trial, robot)
+    trips = trial.angle_deg % 180 != 0
+    held = limits.led if trial.mode == "led" and not trips else limits.held
+    return PushResult(
+        stood_n=stood,
+        fell_n=fell if fell <= FORCE_MAX_N else None,
+        held_limit_n=held.force_n,
+        held_part=held.part,
+        body_limit_n=limits.body.force_n,
+    )
+
+
+def limits_of(trial: PushTrial, robot: RobotConfig) -> PushLimits:
+    """Return the static limits of the trial's pose and direction, on the robot file's robot."""
+    schedule = robot.gain_schedule
+    if schedule is None:
+        raise RunError("the robot has no gain schedule; run `xrl gains`")
+    height, pitch = POSES[trial.pose]
+    poses, scheduled = Poses(robot), ScheduledGains(schedule)
+    z = com_height(poses, height, pitch)
+    stand = stand_at(robot, poses, z, pitch)
+    if stand is None:
+        raise RunError(f"{trial.pose}: this robot does not reach it")
+    angle = math.radians(trial.angle_deg)
+    direction = (math.cos(angle), math.sin(angle))
+    return limits_along(stand, robot, scheduled.at(z, pitch), scheduled.D_B, direction)
+
+
+def _start_of(trial: PushTrial, robot: RobotConfig) -> FleetMoment:
+    fleet = Lockstep(robot, trial.scenario(robot), BASE, plant=trial.plant)
+    for truth in fleet.run():
+        if truth.fallen:
+            raise RunError(f"{trial.pose}: the robot fell before it was pushed")
+        if truth.scenario_s >= BEGIN_S - 0.1:
+            break
+    if fleet.world.scenario_s < BEGIN_S - 0.1:
+        raise RunError(f"{trial.pose}: the six modules never came to track")
+    moment = fleet.moment()
+    return moment if trial.mode == "led" else msgspec.structs.replace(moment, planner=None)
+
+
+def _stands(trial: PushTrial, robot: RobotConfig, start: FleetMoment, force_n: float) -> bool:
+    scenario = trial.scenario(robot, force_n)
+    fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=trial.plant)
+    fleet.resume(start)
+    rows = list(NOBODY.rows_that_count(fleet.run(), -math.inf))
+    return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD
+
 
 ANGLES_DEG: Final = (0, 45, 90, 135, 180)
 """Left and right are alike."""
@@ -53,27 +196,36 @@ class PushStudyFlags(StudyFlags, PlantFlags):
     duration: tuple[Duration, ...] = ()
     """of the pushes; may be repeated (0.3, 3)"""
 
+    def check(self) -> None:
+        """Refuse a log of one point, which is many runs."""
+        super().check()
+        if self.only is not None and self.out is not None:
+            raise RunError("--only: a point is many runs and has no log; leave --out")
+
 
 def trials_of(flags: PushStudyFlags) -> list[PushTrial]:
     """Return the selected points."""
     durations = tuple(flags.duration or DURATIONS_S)
     grid = product(flags.pose or POSES, durations, flags.angle or ANGLES_DEG, MODES)
+    plant = plant_from(flags.plant)
     return [
-        PushTrial(number=number, pose=pose, angle_deg=angle, duration_s=duration, mode=mode)
+        PushTrial(number, pose, angle, duration, mode, plant)
         for number, (pose, duration, angle, mode) in enumerate(grid)
     ]
 
 
-def _inputs(flags: PushStudyFlags) -> dict[str, str]:
-    grid = repr([msgspec.structs.astuple(trial) for trial in trials_of(flags)])
-    return {"plant": plants.to_toml(plant_from(flags.plant)), "grid": grid}
+def row_of(trial: PushTrial) -> dict[str, object]:
+    """Return a point by its columns."""
+    row = msgspec.structs.asdict(trial)
+    del row["plant"]
+    return row
 
 
 def report(finished: StudyRun) -> None:
     """Print the hardest pushes by direction, and what gives way in the weakest."""
     rows = finished.rows
     angles = [f"{angle} deg" for angle in dict.fromkeys(row["angle_deg"] for row in rows)]
-    printed = Printed(title="Hardest push that it stood, N", title_justify="left")
+    printed = Table(title="Hardest push that it stood, N", title_justify="left")
     for heading in ("pose", "s", "planner", *angles, "gives way"):
         printed.add_column(heading, no_wrap=True)
     groups: dict[tuple[str, float, str], list[Row]] = {}
@@ -122,20 +274,18 @@ STUDY: Final = Study[PushTrial](
     name="push",
     case="point",
     table="pushes.csv",
-    pictures={"pushes.png": draw},
     total=lambda flags: len(trials_of(flags)),
     cases=lambda flags, _robot: trials_of(flags).__getitem__,
-    inputs=_inputs,
-    words=lambda at: f"{at.pose}, {at.angle_deg} degrees, {at.duration_s:g} s, {at.mode}",
+    decided_by=("plant", "pose", "angle", "duration"),
+    row=row_of,
     figures=PushResult,
-    trial=push_trial.run_trial,
-    options=lambda flags: {"plant": plant_from(flags.plant)},
-    fell=lambda _row: False,
+    trial=run_trial,
     report=report,
+    draw=draw,
     exit_code=lambda _row: 0,
 )
 
 
 def run(flags: PushStudyFlags) -> int:
-    """Run the study, or one case of it."""
+    """Run the study, or one point of it."""
     return study.run(STUDY, flags)

@@ -1,50 +1,192 @@
-"""`xrl study robust`: every error of the plant drawn at once: who falls, and why."""
+"""`xrl study robust`: every error of the plant drawn at once, led, pushed and killed: who falls.
+
+A trial follows from the seed and its number alone.
+"""
 
 from __future__ import annotations
 
+import math
+import random
 from collections.abc import Callable, Sequence
-from statistics import median
 from typing import TYPE_CHECKING, Annotated, Final
 
+import msgspec
 import numpy as np
 
+from services.simulator.physics.plant import PlantConfig, changed
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.extras import late
 from shared.toml_file import Range
 from tools.flags import Arg, Count, Number
-from tools.lab.studies.sweeps import plants, push_range, robust_trial, study
-from tools.lab.studies.sweeps.figures import Ending
-from tools.lab.studies.sweeps.push_range import PushFlags, PushRange
-from tools.lab.studies.sweeps.report import (
-    FALL_COLOUR,
+from tools.lab.studies.sweeps import plants, study
+from tools.lab.studies.sweeps.figures import (
+    NOBODY,
+    Ended,
+    Ending,
+    Observer,
+    com_max_mm,
+    ending_of,
+    event_steps_nm,
+    operator_peak_n,
     parted,
-    show_falls,
-    show_figures,
-    show_share,
+    scalars,
+    sole_tilt_max_rad,
 )
-from tools.lab.studies.sweeps.robust_trial import RobustResult, RobustTrial
-from tools.lab.studies.sweeps.study import AloneFlags, CaseLog, Study, StudyRun
+from tools.lab.studies.sweeps.plants import PushFlags, PushRange, uniform
+from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import ImuFlags
 from tools.output import Picture, new_figure
+from tools.sim.lockstep import Lockstep
 
 if TYPE_CHECKING:
     from scipy import stats
 else:
     stats = late("scipy.stats")
 
+KINDS: Final = ("squat", "crawl", "lean")
+DELAY_MAX_MS: Final = 10.0
+LEAD_S: Final = 2.0
+"""Each way of a squat; the crawl takes twice that."""
+LEAN_SHARE: Final = (0.15, 0.4)
+LEAN_S: Final = 1.5
+"""A push that lasts, while the planner leads."""
+PUSH_SHARE: Final = (0.3, 1.0)
+"""Shares of the hardest push that is drawn (`PushRange`)."""
+PUSH_S: Final = 0.3
+AFTER_KILL_S: Final = 2.5
+
+
+class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
+    """A trial; the plant follows from seed, number and `beyond`."""
+
+    number: int
+    seed: int
+    beyond: float
+    """Times the ranges of `deploy/plants/ranges.toml`."""
+    slope_deg: float
+    """The floor's slope, in a direction that is drawn; 0: as the ranges have it."""
+    kind: str
+    kill_s: float
+    delay_ms: float
+    pushes: tuple[Push, ...]
+
+    def true_plant(self) -> PlantConfig:
+        """Return the trial's simulated robot."""
+        seed = f"robust {self.seed} {self.number}"
+        plant = plants.draw(seed, beyond=self.beyond)
+        if self.slope_deg == 0.0:
+            return plant
+        angle = uniform(random.Random(f"slope {seed}"), -math.pi, math.pi)
+        slope = math.radians(self.slope_deg)
+        towards = [round(slope * part, 6) for part in (math.cos(angle), math.sin(angle))]
+        return changed(plant, {"floor.slope": towards})
+
+    def scenario(self, robot: RobotConfig) -> Scenario:
+        """Return what happens."""
+        stand = robot.simulation.stand_height
+        ways = {
+            "crawl": (Keyframe(2.0 * LEAD_S, 0.79, pitch=1.2, assist=robot.assist.force_max),),
+            "squat": (Keyframe(LEAD_S, 0.948), Keyframe(2.0 * LEAD_S, stand)),
+            "lean": (Keyframe(LEAD_S, 1.05),),
+        }
+        return Scenario(
+            name=f"robust-{self.seed}-{self.number}",
+            about=f"trial {self.number} of `xrl study robust --seed {self.seed}`",
+            duration=round(self.kill_s + AFTER_KILL_S, 3),
+            keyframe=(Keyframe(0.0, stand), *ways[self.kind]),
+            kill=(Kill(service="planner", at=self.kill_s),),
+            push=self.pushes,
+        )
+
+
+class RobustResult(Ended, frozen=True, kw_only=True):
+    """The figures of a trial; None where there is nothing to measure."""
+
+    operator_peak_n: float | None = None
+    """Vertical force of the hand while the planner leads."""
+    com_led_max_mm: float | None = None
+    """Largest horizontal distance of the COM from the middle of the ankles, led."""
+    com_held_max_mm: float | None = None
+    """The same after the kill."""
+    sole_tilt_max_rad: float | None = None
+    hold_step_nm: float | None = None
+    """Largest step of a joint's torque at a change of mode after the start."""
+
+
+def draw(
+    pushes: PushRange, seed: int, number: int, beyond: float = 1.0, slope_deg: float = 0.0
+) -> RobustTrial:
+    """Return one trial; no other trial has to be drawn for it."""
+    dice = random.Random(f"robust {seed} {number}")
+    kind = KINDS[number % len(KINDS)]
+    way = 2.0 * LEAD_S
+    kill = uniform(dice, 0.6 * way, 1.2 * way)
+    share, lasting = (LEAN_SHARE, LEAN_S) if kind == "lean" else (PUSH_SHARE, PUSH_S)
+    led = pushes.draw(dice, share, 1.0, lasting)
+    held = pushes.draw(dice, PUSH_SHARE, kill + uniform(dice, 0.2, 0.8), PUSH_S)
+    return RobustTrial(
+        number=number,
+        seed=seed,
+        beyond=beyond,
+        slope_deg=slope_deg,
+        kind=kind,
+        kill_s=kill,
+        delay_ms=uniform(dice, 0.5, DELAY_MAX_MS),
+        pushes=(led, held),
+    )
+
+
+def run_trial(trial: RobustTrial, robot: RobotConfig, observer: Observer = NOBODY) -> RobustResult:
+    """Run a trial to its end or to the fall, and measure it."""
+    fleet = Lockstep(
+        robot,
+        trial.scenario(robot),
+        Impairment(delay_ms=trial.delay_ms),
+        seed=trial.number,
+        record=observer.record,
+        plant=trial.true_plant(),
+    )
+    rows = list(observer.rows_that_count(fleet.run(), 0.0))
+    if not rows or rows[0].scenario_s < 0.0:
+        return RobustResult(ending=Ending.FELL if rows else Ending.UNREADY)
+    last = rows[-1]
+    led = [row for row in rows if row.scenario_s < trial.kill_s]
+    held = [row for row in rows if row.scenario_s >= trial.kill_s]
+    events = [event for _, event in fleet.events if rows[0].t_ns <= event.t_ns <= last.t_ns]
+    return RobustResult(
+        ending=ending_of(last, fleet.scenario.duration, robot),
+        fell_at_s=last.scenario_s if last.fallen else None,
+        operator_peak_n=operator_peak_n(led),
+        com_led_max_mm=com_max_mm(led),
+        com_held_max_mm=com_max_mm(held) if held else None,
+        sole_tilt_max_rad=sole_tilt_max_rad(rows),
+        hold_step_nm=max(event_steps_nm(events), default=None),
+    )
+
+
+def row_of(trial: RobustTrial) -> dict[str, object]:
+    """Return every draw by its column: the trial's, then the plant's errors."""
+    row = scalars(trial)
+    for name, push in zip(("led", "held"), trial.pushes, strict=True):
+        row |= {f"push_{name}_x_n": push.force[0], f"push_{name}_y_n": push.force[1]}
+    return row | dict(plants.errors_of(trial.true_plant()))
+
+
 SLOPE_MAX_DEG: Final = 15.0
 RANKED_LEAST: Final = 30
 """Trials from which errors are ranked: among fewer a correlation of 0.36 is chance."""
 FIGURES: Final = (
-    ("operator_peak_n", "operator's force, led", "N"),
-    ("com_led_max_mm", "COM, led", "mm"),
-    ("com_held_max_mm", "COM, after the kill", "mm"),
-    ("sole_tilt_max_rad", "tilt of a sole", "rad"),
-    ("hold_step_nm", "torque step into or out of HOLD", "N m"),
+    ("operator_peak_n", "operator's force, led", "N", 1.0),
+    ("com_led_max_mm", "COM, led", "mm", 1.0),
+    ("com_held_max_mm", "COM, after the kill", "mm", 1.0),
+    ("sole_tilt_max_rad", "tilt of a sole", "rad", 1.0),
+    ("hold_step_nm", "torque step into or out of HOLD", "N m", 1.0),
 )
-
+"""Column, words, unit, and the sign that is worse."""
 
 EXAMPLES: Final = """
 xrl study robust
@@ -55,7 +197,7 @@ xrl study robust --only 17 --out out/trial17
 """
 
 
-class RobustStudyFlags(AloneFlags, ImuFlags, PushFlags):
+class RobustStudyFlags(StudyFlags, ImuFlags, PushFlags):
     """How many, and how far from the file."""
 
     n: Count = 100
@@ -70,11 +212,6 @@ class RobustStudyFlags(AloneFlags, ImuFlags, PushFlags):
         """Refuse ranges that cannot be drawn from."""
         super().check()
         plants.draw("check", beyond=self.beyond)
-
-
-def _cases(flags: RobustStudyFlags, robot: RobotConfig) -> Callable[[int], RobustTrial]:
-    pushes = PushRange(robot, flags.push)
-    return lambda number: robust_trial.draw(pushes, flags.seed, number, flags.beyond, flags.slope)
 
 
 def ranking(rows: Sequence[Row]) -> list[tuple[str, float]]:
@@ -99,69 +236,55 @@ def _excursion(row: Row) -> float:
 
 
 def report(finished: StudyRun) -> None:
-    """Print what came of the study."""
-    rows, console = finished.rows, finished.console
-    standing, fallen = parted(rows)
-    show_falls(
-        fallen, finished.command, lambda row: f"{row['kind']}: trial {row['number']}", console
-    )
-    if standing:
-        show_figures(standing, FIGURES, {"median": median, "largest": max}, console)
+    """Print what came of the study, and which error takes most of the margin."""
+    rows = finished.rows
+    study.show_outcome(finished, FIGURES, lambda row: f"{row['kind']}: trial {row['number']}")
     if len(rows) < RANKED_LEAST:
         most = f"{len(rows)} trials are too few to tell; from {RANKED_LEAST} on they are ranked"
     else:
         most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
-    console.print(f"takes most of the margin (rank correlation): {most}", soft_wrap=True)
-    show_share(len(fallen), len(rows), console)
+    finished.console.print(f"takes most of the margin (rank correlation): {most}", soft_wrap=True)
 
 
-def draw(finished: StudyRun) -> Picture:
-    """Draw what takes the margin, and the excursions by stiffness."""
+def draw_excursions(finished: StudyRun) -> Picture:
+    """Draw the excursions by the drivetrain's stiffness."""
     flags, rows = finished.flags, finished.rows
-    figure = new_figure(13, 6.5)
-    left, right = figure.subplots(1, 2)
-    ranked = ranking(rows)[:14][::-1]
-    left.barh([key for key, _ in ranked], [value for _, value in ranked], color="#1f5f8b")
-    left.axvline(0.0, color="black", linewidth=0.8)
-    left.set_xlabel("rank correlation with the COM's excursion while led")
-    few = f" ({len(rows)} trials: too few to tell)" if len(rows) < RANKED_LEAST else ""
-    left.set_title(f"Which error takes most of the margin{few}")
+    figure = new_figure(9, 6)
+    axis = figure.subplots()
     styles = ("stood", "o", "#1f5f8b"), ("fell", "x", FALL_COLOUR)
     for some, (label, marker, colour) in zip(parted(rows), styles, strict=True):
         x = [row["drivetrain.stiffness"] for row in some]
         y = [min(200.0, _excursion(row)) for row in some]
-        right.scatter(x, y, marker=marker, color=colour, s=18, label=label)
-    right.set_xscale("log")
-    right.set_xlabel("drivetrain stiffness, N m/rad")
-    right.set_ylabel("COM from the middle of the ankles while led, mm (fell: 200)")
-    right.legend()
-    title = f"{len(rows)} trials, every error drawn, ranges x{flags.beyond:g}, seed {flags.seed}, "
-    title += f"{push_range.describe(flags)}: {len(parted(rows)[1])} fell"
+        axis.scatter(x, y, marker=marker, color=colour, s=18, label=label)
+    axis.set(xscale="log", xlabel="drivetrain stiffness, N m/rad")
+    axis.set_ylabel("COM from the middle of the ankles while led, mm (fell: 200)")
+    axis.legend()
+    title = f"{len(rows)} trials, every error drawn, ranges x{flags.beyond:g}, seed {flags.seed},\n"
+    title += f"{plants.describe(flags)}: {len(parted(rows)[1])} fell"
     figure.suptitle(title, x=0.01, ha="left")
     return figure
+
+
+def _cases(flags: RobustStudyFlags, robot: RobotConfig) -> Callable[[int], RobustTrial]:
+    pushes = PushRange(robot, flags.push)
+    return lambda number: draw(pushes, flags.seed, number, flags.beyond, flags.slope)
 
 
 STUDY: Final = Study[RobustTrial](
     name="robust",
     case="trial",
     table="trials.csv",
-    pictures={"trials.png": draw},
     load=lambda flags: experiment.load_robot(flags.config, imu=flags.imu),
     cases=_cases,
-    decided_by=("seed", "beyond", "slope", "push"),
-    inputs=lambda _flags: {"ranges": plants.digest()},
-    row=robust_trial.row_of,
+    decided_by=("beyond", "slope", "push"),
+    row=row_of,
     figures=RobustResult,
-    trial=robust_trial.run_trial,
-    log=CaseLog(
-        robust_trial.scenario_of,
-        robust_trial.plant_of,
-        lambda trial, command: {"lockstep": f"{command}; delay {trial.delay_ms:g} ms"},
-    ),
+    trial=run_trial,
     report=report,
+    draw=draw_excursions,
 )
 
 
 def run(flags: RobustStudyFlags) -> int:
-    """Run the study, or one case of it."""
+    """Run the study, or one trial of it."""
     return study.run(STUDY, flags)

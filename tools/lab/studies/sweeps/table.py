@@ -1,69 +1,31 @@
-"""A study's table: one row per case, appended on completion; an interrupted study resumes.
+"""A study's table: one CSV row per case, appended on completion; an interrupted study resumes.
 
-Beside the table, `inputs.json` holds its parameters; a folder with others is refused, and so is one
-that another study is writing to. A finished table is sorted by case: equal inputs give an equal
-file.
+Beside the table, `inputs.json` holds its parameters. A folder with other parameters is refused, and
+so is one that another study is writing to. A finished table is sorted by case: equal inputs give an
+equal file.
 """
 
 from __future__ import annotations
 
-import ast
 import csv
 import fcntl
-import hashlib
 import io
 import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import msgspec
 
 from shared.atomic_file import atomic_file
 from shared.exceptions import RunError
-from shared.places import CHECKOUT
 
 INPUTS_FILE: Final = "inputs.json"
 DECIMALS: Final = 9
-"""To which a number of a flag is taken."""
+"""Decimals of a flag's number."""
 Row: TypeAlias = Mapping[str, Any]
 """A case's draws as they were drawn, then its figures as the table has them."""
-
-
-def code_of(*modules: str) -> tuple[str, ...]:
-    """Return all of our code that some modules of the tools run: the parts for `code_digest`.
-
-    Args:
-        modules: by name, such as `tools.sim.lockstep`.
-
-    Returns:
-        Services and shared, and of the tools the files of these modules and of all that they
-        import, and so on.
-    """
-    todo, files = list(modules), set[str]()
-    while todo:
-        name = todo.pop()
-        file = f"{name.replace('.', '/')}.py"
-        if file in files or not name.startswith("tools.") or not (CHECKOUT / file).is_file():
-            continue
-        files.add(file)
-        for node in ast.walk(ast.parse((CHECKOUT / file).read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                todo += [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                todo += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return ("services", "shared", *sorted(files))
-
-
-def code_digest(parts: Sequence[str]) -> str:
-    """Return the SHA-256 of Python files, named as files or folders from the root on."""
-    digest = hashlib.sha256()
-    for part in parts:
-        place = CHECKOUT / part
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(path.relative_to(CHECKOUT).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()
 
 
 class CaseTable:
@@ -76,12 +38,10 @@ class CaseTable:
         figures: type[msgspec.Struct],
         inputs: Mapping[str, str],
     ) -> None:
-        """Open a table, new or to resume.
-
-        Incomplete or damaged rows are left out, and those of other draws: their cases run again.
+        """Open a table, new or to resume; incomplete or damaged rows are left out.
 
         Args:
-            path: of the CSV file; its folder is made if it is not there.
+            path: of the CSV file; its folder is made if it is missing.
             drawn: by case, the start of its row; the first column is the case's number.
             figures: the rest of a row.
             inputs: parameters of the rows, by name.
@@ -93,20 +53,13 @@ class CaseTable:
         folder = path.parent
         self._path, self._figures = path, figures
         self._columns = [*drawn[0], *figures.__struct_fields__]
-        self._words = {
-            field.name
-            for field in msgspec.structs.fields(figures)
-            if getattr(field.type, "__origin__", field.type) is str
-        }
-        self._drawn = {str(case[self._columns[0]]): case for case in drawn}
+        self._drawn = {int(str(case[self._columns[0]])): case for case in drawn}
         self._rows: dict[int, dict[str, str]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()) and not (folder / INPUTS_FILE).exists() and not path.exists():
-                raise RunError(f"{folder}: holds other files than a study's; choose another --out")
-            self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8")
+            self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8", errors="replace")
             try:
-                _claim(self._inputs, path, inputs)
+                self._claim(inputs)
                 self._read()
                 self._write()
                 self._file = path.open("a", encoding="utf-8", newline="")
@@ -121,21 +74,21 @@ class CaseTable:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Sort the rows and close the file; however the study ended."""
+        """Sort the rows and close the file, however the study ended."""
         self._file.close()
         self._write()
         self._inputs.close()
 
     @property
     def numbers(self) -> set[int]:
-        """The cases that are done, also those that are not asked for now."""
+        """The cases that are done, also those that this call does not ask for."""
         return set(self._rows)
 
     @property
     def rows(self) -> list[Row]:
-        """The rows of the cases that are done, in order."""
-        asked = sorted(number for number in self._rows if str(number) in self._drawn)
-        return [self._typed(self._rows[number]) for number in asked]
+        """The rows of the asked cases that are done, in order."""
+        return [self._typed(row) for number, row in sorted(self._rows.items())
+                if number in self._drawn]  # fmt: skip
 
     def add(self, case: Mapping[str, object], figures: msgspec.Struct) -> Row:
         """Write a row and return it; a value that is None is left empty."""
@@ -148,36 +101,65 @@ class CaseTable:
 
     def _typed(self, row: Mapping[str, str]) -> Row:
         """Return a row with its values; raise `msgspec.ValidationError` if it is damaged."""
-        figures = {
-            name: row[name] if row[name] or name in self._words else None
-            for name in self._figures.__struct_fields__
-        }
-        typed = msgspec.convert(figures, self._figures, strict=False)
-        drawn = self._drawn.get(row[self._columns[0]], row)
-        return {**drawn, **msgspec.structs.asdict(typed)}
+        texts = {name: row[name] or None for name in self._figures.__struct_fields__}
+        figures = msgspec.convert(texts, self._figures, strict=False)
+        drawn = self._drawn.get(int(row[self._columns[0]]), row)
+        return {**drawn, **msgspec.structs.asdict(figures)}
+
+    def _claim(self, inputs: Mapping[str, str]) -> None:
+        """Lock the inputs' file; write them into it, or compare them with what it holds."""
+        folder, file = self._path.parent, self._inputs
+        others = {one.name for one in folder.iterdir()} - {INPUTS_FILE}
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(
+                f"{folder}: another study is writing there; choose another --out"
+            ) from None
+        file.seek(0)
+        text = file.read()
+        if not text and not others:
+            file.write(json.dumps(dict(inputs), indent=2) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+            return
+        try:
+            there = msgspec.json.decode(text, type=dict[str, str])
+        except msgspec.DecodeError:
+            if not text:
+                (folder / INPUTS_FILE).unlink()
+            raise RunError(
+                f"{folder}: holds other files than a study's, or a damaged {INPUTS_FILE}; choose "
+                "another --out"
+            ) from None
+        for name, value in inputs.items():
+            if there.get(name) != value:
+                raise RunError(
+                    f"{folder}: holds a study of another {name} ({str(there.get(name))[:20]}, now "
+                    f"{value[:20]}); choose another --out"
+                )
 
     def _read(self) -> None:
-        """Read the rows that are whole, and of the cases that are drawn.
+        """Read the rows that are whole.
 
         Raises:
             RunError: the file has other columns.
         """
         if not self._path.exists():
             return
-        text = self._path.read_text(encoding="utf-8-sig", errors="replace")
-        lines = map(_cells, text.split("\n")[:-1])  # a line without an end is incomplete
-        if next(lines, self._columns) != self._columns:
+        text = self._path.read_text(encoding="utf-8", errors="replace")
+        lines = text[: text.rfind("\n") + 1].splitlines()  # a line without an end is incomplete
+        if lines and lines[0].split(",") != self._columns:
             raise RunError(f"{self._path}: has other columns; choose another --out")
-        for cells in lines:
+        for line in lines[1:]:
+            cells = next(csv.reader([line]), [])
             if len(cells) == len(self._columns) and cells[0].isdecimal():
                 row = dict(zip(self._columns, cells, strict=True))
-                case = self._drawn.get(cells[0], {})
                 try:
                     self._typed(row)
                 except msgspec.ValidationError:
                     continue
-                if all(row[name] == _text(value) for name, value in case.items()):
-                    self._rows[int(cells[0])] = row
+                self._rows[int(cells[0])] = row
 
     def _write(self) -> None:
         """Rewrite all rows atomically."""
@@ -187,54 +169,6 @@ class CaseTable:
             writer.writeheader()
             writer.writerows(row for _, row in sorted(self._rows.items()))
             file.detach()
-
-
-def _claim(file: IO[str], table: Path, inputs: Mapping[str, str]) -> None:
-    """Lock the inputs' file; write them into it, or compare them with those that are there.
-
-    Raises:
-        RunError: it is locked, or they differ.
-    """
-    folder = table.parent
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise RunError(f"{folder}: another study is writing there; choose another --out") from None
-    file.seek(0)
-    try:
-        text = file.read()
-        there = json.loads(text) if text else None
-    except ValueError:
-        text, there = "?", None
-    if not text and not table.exists():
-        file.write(json.dumps(dict(inputs), indent=2) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-        return
-    if not isinstance(there, dict):
-        raise RunError(
-            f"{folder}: {INPUTS_FILE} does not say what {table.name} was made from; choose another "
-            "--out"
-        )
-    for name, value in inputs.items():
-        if there.get(name) != value:
-            raise RunError(
-                f"{folder}: holds a study of another {name} "
-                f"({_short(there.get(name))}, now {_short(value)}); choose another --out"
-            )
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    return text if len(text) <= 20 else f"{text[:8]}..."
-
-
-def _cells(line: str) -> list[str]:
-    """Return the cells of a line; none if it is malformed."""
-    try:
-        return next(csv.reader([line], strict=True), [])
-    except csv.Error:
-        return []
 
 
 def _text(value: object) -> str:

@@ -12,6 +12,7 @@ from shared.config.robot_config import OPTIONAL, SERVICES
 from shared.config.scenarios import FAULT_KINDS, Fault, Kill
 from shared.joints import MODULES
 from shared.robot.fault_table import DRIVE_FAULTS
+from tools.lab.studies.crash import matrix
 from tools.lab.studies.crash.cases import (
     BACK_S,
     CASES,
@@ -21,7 +22,6 @@ from tools.lab.studies.crash.cases import (
     CrashVerdict,
     scenario_of,
 )
-from tools.verbs.study import crash
 
 BY_NAME = {case.name: case for case in CASES}
 
@@ -53,7 +53,7 @@ def test_pairs_all_joint_services_and_the_planner_coming_back_are_tried() -> Non
 def test_the_short_run_has_one_of_each_kind_in_five_minutes() -> None:
     quick = [case for case in CASES if case.quick]
     assert {case.kind for case in quick} == {case.kind for case in CASES}
-    assert len(quick) * crash.CASE_S <= 300.0
+    assert len(quick) * matrix.CASE_S <= 300.0
 
 
 def test_names_are_their_own_and_can_be_folders() -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from tools.lab.studies.sweeps import dynamics_trial, kill_trial
+from tools.lab.studies.sweeps import kill
 from tools.sim.lockstep import Lockstep, begin_standing
 
 
@@ -17,5 +17,4 @@ def on_its_feet(monkeypatch: pytest.MonkeyPatch) -> None:
         begin_standing(fleet)
         return fleet
 
-    for module in (dynamics_trial, kill_trial):
-        monkeypatch.setattr(module, "Lockstep", standing)
+    monkeypatch.setattr(kill, "Lockstep", standing)

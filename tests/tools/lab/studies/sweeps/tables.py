@@ -1,25 +1,27 @@
-"""A study through the command line, the table that it wrote, and work for processes."""
+"""A study through the command line, the table that it wrote, and a study that costs nothing."""
 
 from __future__ import annotations
 
 import csv
 import io
 import os
-import pickle
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-import pytest
+import msgspec
 
+from services.simulator.physics.plant import PlantConfig
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
+from tests.lockstep.runs import still
 from tools import cli
-from tools.lab.studies.sweeps import pool
-from tools.lab.studies.sweeps.study import StudyFlags, StudyRun
+from tools.flags import Count
+from tools.lab.studies.sweeps.figures import Ended, Ending, Observer
+from tools.lab.studies.sweeps.study import Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
+from tools.output import Picture, new_figure
 from tools.terminal import Console
 
 
@@ -45,38 +47,57 @@ def printed(report: Callable[[StudyRun], None], done: StudyRun) -> str:
     return done.console.file.getvalue()  # type: ignore[attr-defined,no-any-return]
 
 
-def run_cases_here(patch: pytest.MonkeyPatch) -> None:
-    """Run cases in this process, sent to themselves as to a worker: its start takes longer."""
+class ToyFlags(StudyFlags):
+    """Flags of a study whose cases cost nothing."""
 
-    def results(
-        work: Callable[[Any], Any], tasks: Sequence[Any], *_: object
-    ) -> Iterator[tuple[Any, Any]]:
-        for task in tasks:
-            run, sent = pickle.loads(pickle.dumps((work, task)))  # noqa: S301 - our own
-            yield task, run(sent)
+    n: Count = 3
+    """cases"""
+    nap: float = 0.0
+    """s, for each case"""
 
-    patch.setattr(pool, "results", results)
+
+class ToyCase(msgspec.Struct, frozen=True):
+    number: int
+    seed: int
+    nap: float
+
+    def scenario(self, _robot: RobotConfig) -> Scenario:
+        return still(1.0)
+
+    def true_plant(self) -> PlantConfig:
+        return PlantConfig()
+
+
+def run_toy(case: ToyCase, _robot: RobotConfig, _observer: Observer) -> Ended:
+    """Case 2 of seed 7 falls, case 2 of seed 8 fails, case 1 of seed 9 kills its process."""
+    time.sleep(case.nap)
+    if (case.seed, case.number) == (8, 2):
+        raise ValueError("two\nlines")
+    if (case.seed, case.number) == (9, 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    fell = (case.seed, case.number) == (7, 2)
+    return Ended(ending=Ending.FELL if fell else Ending.STOOD, fell_at_s=1 / 3 if fell else None)
+
+
+def draw_toy(_finished: StudyRun) -> Picture:
+    return new_figure(2, 2)
+
+
+TOY = Study[ToyCase](
+    name="toy",
+    table="toy.csv",
+    cases=lambda flags, _robot: lambda number: ToyCase(number, flags.seed, flags.nap),
+    figures=Ended,
+    trial=run_toy,
+    report=lambda done: done.console.print(f"{len(done.rows)} rows"),
+    draw=draw_toy,
+)
 
 
 def square(number: int) -> int:
     return number * number
 
 
-def stumble(number: int) -> int:
-    if number == 2:
-        raise ValueError("two\nlines")
-    return number
-
-
-def die(_number: int) -> int:
-    os.kill(os.getpid(), signal.SIGKILL)
-    return 0
-
-
 def sleep(seconds: float) -> float:
     time.sleep(seconds)
     return seconds
-
-
-def give_up(_number: int) -> int:
-    raise CancelledError("scheduler-connection-lost.\nClient lost the connection.")

@@ -25,7 +25,7 @@ class End(StrEnum):
 class Figures(msgspec.Struct):
     value: float | None
     end: End = End.FELL
-    words: str = ""
+    words: str | None = None
 
 
 DRAWN: Sequence[Mapping[str, object]] = [{"number": n, "drawn": n / 2} for n in (1, 2, 3)]
@@ -99,8 +99,6 @@ def test_a_folder_of_other_inputs_is_refused(tmp_path: Path) -> None:
         b"2,1,0.5,stood,,1\r\n",
         b'"2,1,0.5,stood,\r\n',
         b"2,1,\xff\xfe,stood,\r\n",
-        b"2,1.5,0.5,stood,\r\n",
-        b"2,,0.5,stood,\r\n",
         b"\x00\x00\r\n",
         b"\r\n",
     ],
@@ -133,7 +131,7 @@ def test_a_table_of_unknown_inputs_is_refused_and_left_alone(
     else:
         (tmp_path / "inputs.json").write_bytes(inputs)
     for _ in range(2):
-        with pytest.raises(RunError, match=r"does not say what t\.csv was made from"):
+        with pytest.raises(RunError, match=r"damaged inputs\.json"):
             table_in(tmp_path)
     assert (tmp_path / "t.csv").read_bytes() == before
 
@@ -155,6 +153,6 @@ def test_two_studies_do_not_write_into_one_table(tmp_path: Path) -> None:
 
 def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(b"a run")
-    with pytest.raises(RunError, match="holds other files than a study's; choose another --out"):
+    with pytest.raises(RunError, match="holds other files than a study's"):
         table_in(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]

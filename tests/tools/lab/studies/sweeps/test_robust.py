@@ -15,17 +15,10 @@ from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.messages import filled, sample
 from tests.tools.lab.studies.sweeps.tables import finished, printed
-from tools.lab.studies.sweeps import plants, robust, robust_trial
+from tools.lab.studies.sweeps import plants, robust
 from tools.lab.studies.sweeps.figures import Ending, Observer
-from tools.lab.studies.sweeps.push_range import PushRange
-from tools.lab.studies.sweeps.robust_trial import (
-    KINDS,
-    draw,
-    plant_of,
-    row_of,
-    run_trial,
-    scenario_of,
-)
+from tools.lab.studies.sweeps.plants import PushRange
+from tools.lab.studies.sweeps.robust import KINDS, draw, row_of, run_trial
 from tools.output import save_figure
 
 
@@ -44,7 +37,7 @@ def rows_by(drawn: list[dict[str, object]], cause: str) -> list[dict[str, object
     dice = random.Random(cause)
     rows = []
     for row in drawn:
-        far = 100.0 * abs(float(row[cause])) + dice.uniform(0.0, 1e-3)
+        far = 100.0 * abs(float(str(row[cause]))) + dice.uniform(0.0, 1e-3)
         rows.append(row | {"ending": Ending.STOOD, "com_led_max_mm": far})
     return rows
 
@@ -55,7 +48,7 @@ def test_every_trial_is_a_scenario_that_ends_after_its_kill(
     assert {draw(pushes, 1, number).kind for number in range(3)} == set(KINDS)
     for number in range(30):
         trial = draw(pushes, 1, number)
-        scenario = scenario_of(robot, trial)
+        scenario = trial.scenario(robot)
         assert scenario.duration > trial.kill_s + 2.0
         assert all(push.at + push.duration < scenario.duration for push in scenario.push)
 
@@ -85,7 +78,7 @@ def test_a_change_of_mode_after_the_fall_does_not_count(
                 for t_s in range(4)
             ]
 
-    monkeypatch.setattr(robust_trial, "Lockstep", Fleet)
+    monkeypatch.setattr(robust, "Lockstep", Fleet)
     outcome = run_trial(draw(pushes, 1, 0), robot, Observer(after_fall_s=1.0))
     assert (outcome.fell_at_s, outcome.hold_step_nm) == (2.0, 1.41)
 
@@ -104,7 +97,7 @@ def test_the_ranking_finds_the_error_that_moves_the_com(
 def test_of_a_few_trials_no_error_is_ranked(
     robot: RobotConfig, drawn: list[dict[str, object]], few: bool
 ) -> None:
-    figures = dict.fromkeys(key for key, _, _ in robust.FIGURES)
+    figures = dict.fromkeys(key for key, *_ in robust.FIGURES)
     rows = [figures | row for row in rows_by(drawn, "drive.lag_s")[: robust.RANKED_LEAST - few]]
     said = printed(robust.report, finished(rows, robot, robust.RobustStudyFlags()))
     assert ("too few to tell" in said) is few
@@ -116,7 +109,7 @@ def test_a_picture_is_drawn_and_falls_are_in_it(
 ) -> None:
     rows = rows_by(drawn, "drive.lag_s")
     rows[3] |= {"ending": Ending.FELL, "com_led_max_mm": None}
-    figure = robust.draw(finished(rows, robot, robust.RobustStudyFlags()))
+    figure = robust.draw_excursions(finished(rows, robot, robust.RobustStudyFlags()))
     save_figure(figure, tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 20_000
 
@@ -153,8 +146,8 @@ def test_a_slope_that_is_asked_for_has_its_size_and_any_direction_and_all_else_a
 ) -> None:
     angles = []
     for number in range(40):
-        plain = plant_of(draw(pushes, 1, number))
-        sloping = plant_of(draw(pushes, 1, number, 1.0, 5.0))
+        plain = draw(pushes, 1, number).true_plant()
+        sloping = draw(pushes, 1, number, 1.0, 5.0).true_plant()
         x, y = sloping.floor.slope
         assert math.hypot(x, y) == pytest.approx(math.radians(5.0), abs=1e-5)
         angles.append(math.atan2(y, x))

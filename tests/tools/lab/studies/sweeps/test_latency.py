@@ -18,9 +18,9 @@ from shared.links import DIRECTIONS
 from tests.messages import sample
 from tests.tools.lab.studies.sweeps.tables import finished, printed
 from tools.flags import add_flags, read_flags
-from tools.lab.studies.sweeps import latency, latency_report
+from tools.lab.studies.sweeps import latency
 from tools.lab.studies.sweeps.figures import Ending
-from tools.lab.studies.sweeps.latency_trial import (
+from tools.lab.studies.sweeps.latency import (
     CONTROLS,
     DURATION_S,
     PUSH_S,
@@ -231,47 +231,35 @@ def made_up(fell: Callable[[str, float, float], bool]) -> list[Row]:
 
 def shown(rows: Sequence[Row], robot: RobotConfig) -> str:
     done = finished(rows, robot, latency.LatencyStudyFlags(), "xrl study latency")
-    return printed(latency_report.show, done)
+    return printed(latency.report, done)
 
 
-def test_falls_are_counted_where_they_were(robot: RobotConfig) -> None:
-    rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
-    assert latency_report.controls_in(rows) == ["distributed", "centralised"]
-    own = latency_report.chosen(rows, "centralised", delay_ms=50.0)
-    assert latency_report.falls(own) == (4, 4)
-    assert latency_report.falls(latency_report.chosen(rows, "centralised")) == (4, 8)
-    assert latency_report.falls(own).bounds[0] > 0.3
-    assert {row["loss"] for row in latency_report.without_loss(rows)} == {"0"}
-    output = shown(rows, robot)
-    assert "centralised: 4 of 8 fell; most at 50 ms, 4 of 4" in output
-    assert "distributed: none of 8 fell" in output
-    assert "xrl study latency --only 4" in output
-
-
-def test_each_delay_has_bounds_of_its_own_and_names_their_mix(robot: RobotConfig) -> None:
+def test_falls_are_counted_by_delay_and_control_with_bounds_of_their_own(
+    robot: RobotConfig,
+) -> None:
     """The worst of several delays is chosen: 95 % of it would be 83 %."""
     rows = made_up(lambda control, delay, _loss: control == "centralised" and delay == 50.0)
-    table, _, rest = shown(rows, robot).partition("Hand's peak force")
-    assert "in this mix: 0, 50 % lost" in " ".join(table.split())
-    assert [" ".join(line.split()) for line in table.splitlines() if " of 4" in line] == [
-        "0 0 of 4 0-49 % 0 of 4 0-49 %",
-        "50 0 of 4 0-49 % 4 of 4 51-100 %",
-    ]
-    assert "Wilson" not in rest
+    cells = latency.cells_of(rows)
+    assert list(dict.fromkeys(name for name, _ in cells)) == ["distributed", "centralised"]
+    assert (cells["centralised", 50.0].fallen, cells["centralised", 50.0].of) == (4, 4)
+    assert cells["centralised", 0.0].fallen == 0
+    output = shown(rows, robot)
+    assert "mix: 0, 50 % lost" in " ".join(output.split())
+    assert "4/4 51-100 %" in output
+    assert output.count("0/4") == 3
+    assert "centralised: 4 of 8 fell" in output
+    assert "distributed: 0 of 8 fell" in output
+    assert "xrl study latency --only 4" in output
     both = [{**row, "jitter_ms": jitter} for row in rows for jitter in ("0", "5")]
-    assert latency_report.mix(both) == "0, 50 % lost, 0, 5 ms of jitter"
-
-
-def test_a_study_with_trials_missing_reports_how_many_there_are() -> None:
-    rows = made_up(lambda *_: False)
-    assert latency_report._each(rows) == "4 trials a point"
-    assert latency_report._each(rows[:-1]) == "3 to 4 trials a point"
+    assert latency.mix(both) == "0, 50 % lost, 0, 5 ms"
 
 
 def test_pictures_are_drawn_of_what_there_is(robot: RobotConfig, tmp_path: Path) -> None:
     """A study that was stopped early, and one in which everything fell at once."""
     rows = made_up(lambda *_: True)
     short = [{**row, "operator_peak_n": None, "hold_share": None} for row in rows[:3]]
-    for some, draw in product((rows, short), latency.STUDY.pictures.values()):
-        save_figure(draw(finished(some, robot, latency.LatencyStudyFlags())), tmp_path / "a.png")
+    for some in (rows, short):
+        save_figure(
+            latency.draw(finished(some, robot, latency.LatencyStudyFlags())), tmp_path / "a.png"
+        )
         assert 10_000 < (tmp_path / "a.png").stat().st_size < 150_000

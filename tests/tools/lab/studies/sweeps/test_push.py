@@ -10,19 +10,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from services.simulator.physics.plant import PlantConfig
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from tests.tools.lab.studies.sweeps.tables import finished
-from tools.lab.studies.sweeps import push, push_trial
-from tools.lab.studies.sweeps.push_range import PushRange
-from tools.lab.studies.sweeps.push_trial import (
-    PushResult,
-    PushTrial,
-    limits_of,
-    run_trial,
-    scenario_of,
-)
+from tools.lab.studies.sweeps import push
+from tools.lab.studies.sweeps.plants import PushRange
+from tools.lab.studies.sweeps.push import PushResult, PushTrial, limits_of, row_of, run_trial
 from tools.output import save_figure
 
 
@@ -50,19 +43,19 @@ def test_the_grid_has_every_pose_duration_angle_and_mode_once() -> None:
 def test_the_bisection_finds_the_force_within_its_step(
     falls_from: float, robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(push_trial, "_start_of", lambda *_: None)
-    monkeypatch.setattr(push_trial, "_stands", lambda _t, _r, _p, _s, force: force < falls_from)
-    outcome = run_trial(point(), robot, PlantConfig())
-    if falls_from > push_trial.FORCE_MAX_N:
+    monkeypatch.setattr(push, "_start_of", lambda *_: None)
+    monkeypatch.setattr(push, "_stands", lambda _t, _r, _s, force: force < falls_from)
+    outcome = run_trial(point(), robot)
+    if falls_from > push.FORCE_MAX_N:
         assert outcome.fell_n is None
-        assert outcome.stood_n >= push_trial.FORCE_MAX_N - push_trial.STEP_N
+        assert outcome.stood_n >= push.FORCE_MAX_N - push.STEP_N
     else:
         assert outcome.fell_n is not None
         assert outcome.stood_n < falls_from <= outcome.fell_n
-        assert outcome.fell_n - outcome.stood_n <= push_trial.STEP_N
+        assert outcome.fell_n - outcome.stood_n <= push.STEP_N
 
 
-@pytest.mark.parametrize("pose", push_trial.POSES)
+@pytest.mark.parametrize("pose", push.POSES)
 @pytest.mark.parametrize("angle", push.ANGLES_DEG)
 def test_no_mode_holds_more_than_the_body_bears(pose: str, angle: int, robot: RobotConfig) -> None:
     limits = limits_of(point(pose=pose, angle_deg=angle), robot)
@@ -77,17 +70,17 @@ def test_a_robot_without_a_schedule_is_refused(robot: RobotConfig) -> None:
 
 def test_with_the_planner_dead_a_lasting_push_from_the_side_is_stood(robot: RobotConfig) -> None:
     """30 N for 3 s made it fall; the certificate read 1.08."""
-    trial, plant = point(pose="stand"), PlantConfig()
-    start = push_trial._start_of(trial, robot, plant)
+    trial = point(pose="stand")
+    start = push._start_of(trial, robot)
     assert start.planner is None
-    assert push_trial._stands(trial, robot, plant, start, 50.0)
-    assert not push_trial._stands(trial, robot, plant, start, 150.0), "it can fall here"
+    assert push._stands(trial, robot, start, 50.0)
+    assert not push._stands(trial, robot, start, 150.0), "it can fall here"
 
 
-def test_the_push_is_in_the_direction_that_was_asked_for() -> None:
-    x, y, _ = scenario_of(point(angle_deg=180), 40.0).push[0].force
+def test_the_push_is_in_the_direction_that_was_asked_for(robot: RobotConfig) -> None:
+    x, y, _ = point(angle_deg=180).scenario(robot, 40.0).push[0].force
     assert (x, y) == pytest.approx((-40.0, 0.0), abs=1e-9)
-    assert scenario_of(point(mode="led"), 40.0).kill == ()
+    assert point(mode="led").scenario(robot, 40.0).kill == ()
 
 
 def test_a_table_is_drawn_with_both_modes_and_the_limits(
@@ -98,7 +91,7 @@ def test_a_table_is_drawn_with_both_modes_and_the_limits(
         stood_n=50.0, fell_n=55.0, held_limit_n=40.0, held_part="left sole's toe", body_limit_n=90.0
     )
     figures = msgspec.structs.asdict(outcome)
-    rows = [msgspec.structs.asdict(trial) | figures for trial in trials]
+    rows = [row_of(trial) | figures for trial in trials]
     save_figure(push.draw(finished(rows, robot, push.PushStudyFlags())), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 30_000
 

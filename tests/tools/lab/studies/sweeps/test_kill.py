@@ -19,22 +19,22 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario, lead
 from shared.robot.robot_model import stand_pose
 from tests.messages import filled, sample
-from tests.tools.lab.studies.sweeps.tables import run_cases_here
 from tools.judge.standing import is_tipping
 from tools.lab.design import split_program
-from tools.lab.studies.sweeps import kill_trial as cases
+from tools.lab.studies.sweeps import kill as cases
 from tools.lab.studies.sweeps.figures import Ending, Observer, with_payload
-from tools.lab.studies.sweeps.kill_trial import (
+from tools.lab.studies.sweeps.kill import (
     FootLoads,
     KillCase,
     KillCases,
     KillRecorder,
-    prepare,
+    robots_of,
     run_case,
 )
-from tools.lab.studies.sweeps.push_range import PushRange
+from tools.lab.studies.sweeps.plants import PushRange
 from tools.sim import lockstep
 from tools.sim.lockstep import Lockstep
+from tools.terminal import Console
 
 DRAWN = 200
 
@@ -52,27 +52,20 @@ def diagonal(robot: RobotConfig) -> RobotConfig:
     return msgspec.structs.replace(robot, law=law)
 
 
-def test_a_payload_gets_a_schedule_that_fits(
-    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
+def test_each_payload_gets_a_schedule_that_fits_and_the_papers_split_needs_none(
+    robot: RobotConfig,
+    diagonal: RobotConfig,
+    drawn: list[KillCase],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    run_cases_here(monkeypatch)
     monkeypatch.setattr(split_program, "N_HEIGHTS", 2)
-    other = with_payload(robot, 10.2)
-    reported: list[tuple[int, int]] = []
-    ready = prepare([robot, other], 2, lambda done, of: reported.append((done, of)))
-    assert ready[0] is robot, "its schedule was made for it"
+    two = [msgspec.structs.replace(drawn[0], payload_kg=kg) for kg in (robot.mass.payload, 10.2)]
+    ready = robots_of(two, robot, 1, Console(quiet=True))
+    assert ready[0] == robot, "its schedule was made for it"
     assert [gain_schedule.why_stale(one) for one in ready] == ["", ""]
     assert ready[1].mass.payload == 10.2
-    assert reported == [(0, 1), (1, 1)]
-
-
-def test_the_papers_split_needs_no_schedule(diagonal: RobotConfig) -> None:
-    other = with_payload(diagonal, 10.2)
-    assert prepare([other], 2) == [other]
-
-
-def test_no_two_cases_are_alike(drawn: list[KillCase]) -> None:
-    assert len({case.kill_s for case in drawn}) > 0.9 * DRAWN
+    bare = robots_of(two[1:], diagonal, 1, Console(quiet=True))
+    assert bare == [with_payload(diagonal, 10.2)]
 
 
 def test_no_draw_is_beyond_the_study(robot: RobotConfig, drawn: list[KillCase]) -> None:
@@ -116,33 +109,17 @@ def test_every_kind_of_case_is_drawn(drawn: list[KillCase]) -> None:
     assert len(quadrants) == 4
 
 
-def test_the_planner_dies_on_the_way_or_after_it(robot: RobotConfig, drawn: list[KillCase]) -> None:
-    for case in drawn:
-        there = cases.scenario_of(robot, case).keyframe[-1].at
-        assert there == case.way_end_s
-        assert (case.kill_s < there) if case.moving else (case.kill_s >= there + 0.3)
-
-
 def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[KillCase]) -> None:
     for case in drawn:
-        scenario = cases.scenario_of(robot, case)
+        scenario = case.scenario(robot)
         scenarios.check("case", scenario)
         assert [row.at for row in scenario.kill] == [case.kill_s]
+        there = scenario.keyframe[-1].at
+        assert (case.kill_s < there) if case.moving else (case.kill_s >= there + 0.3)
         assert scenario.push == case.pushes
         for pose, frame in zip(case.poses, scenario.keyframe[1:], strict=True):
             led = lead(scenario, frame.at)
             assert (led.height, led.pitch, led.assist) == msgspec.structs.astuple(pose)
-
-
-def test_no_operator_leads_faster_than_the_pace(robot: RobotConfig, drawn: list[KillCase]) -> None:
-    for case in drawn:
-        for a, b in pairwise(cases.scenario_of(robot, case).keyframe):
-            for way, speed in zip(
-                (b.height - a.height, b.pitch - a.pitch, b.assist - a.assist),
-                cases.SPEED,
-                strict=True,
-            ):
-                assert abs(way) <= 1.001 * case.pace * speed * (b.at - a.at)
 
 
 @pytest.mark.parametrize(("height", "pitch"), [(0.79, 1.2), (0.85, 0.0), (1.2, 0.6)])

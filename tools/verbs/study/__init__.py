@@ -1,1 +1,0 @@
-"""`xrl study`: many runs, in virtual time or live; the sweeps are in `tools.lab.studies`."""
