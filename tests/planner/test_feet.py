@@ -28,7 +28,7 @@ from shared.config.robot_config import GRAVITY
 from tests.imu.robots import with_imu
 from tests.planner import oracle
 from tests.planner.oracle import LEFT, RIGHT
-from tests.planner.states import DT, ROBOT, STILL, Kept, Law, closed
+from tests.planner.states import DT, ROBOT, Kept, Law, closed
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import stand_at
 from tools.lab.design.torque_breakdown import torque_breakdown
@@ -139,7 +139,7 @@ def test_each_sole_is_asked_for_little_moment_where_it_stands(
 def test_feet_astray_make_no_step_at_align() -> None:
     """What the legs disagree by is how the feet stand: it is taken, not fought."""
     q = closed(1.0, pitch=0.3) + 1e-2 * np.random.default_rng(4).normal(size=12)
-    output = Law().align(q, STILL, 0.0, DT)
+    output = Law().align(q)
     assert np.abs(oracle.closure(ROBOT, q)).max() > 1e-2
     np.testing.assert_allclose(output.q_ref, q, atol=1e-5)
     np.testing.assert_allclose(output.closure, 0.0, atol=1e-6)
@@ -330,7 +330,7 @@ def test_on_a_slope_feedforward_holds_the_weight_along_every_closed_motion(
 
 def test_a_tick_is_laid_open_with_its_slope() -> None:
     law, q, still = Law(with_imu(ROBOT)), closed(1.0), np.zeros(12)
-    output = law.align(q, still, 0.0, DT, up_torso=told((0.0873, -0.03)))
+    output = law.align(q, up_torso=told((0.0873, -0.03)))
     found = torque_breakdown(ROBOT, q, still, output.q_ref, output.v_ref, 0.0, output.slope)
     np.testing.assert_allclose(found.gravity, output.tau_ff, atol=1e-6)
 

@@ -170,9 +170,9 @@ def test_the_first_tick_takes_the_assist_over_and_the_next_ramp_while_aligning_t
 ) -> None:
     q, most = closed(1.188), ROBOT.assist.force_max
     law.align(q)
-    ramped = law.align(q, STILL, most, DT).assist
+    ramped = law.align(q, most).assist
     assert ramped == pytest.approx(ROBOT.assist.rate_max * DT)
-    assert Law().align(q, STILL, 1e4, DT).assist == most
+    assert Law().align(q, 1e4).assist == most
 
 
 def test_references_come_back_after_a_lift_past_the_knees_soft_stop(law: Law) -> None:
@@ -225,8 +225,8 @@ def torque(output: LawOutput, q: Array, v: Array = STILL) -> Array:
 def settled(law: Law, q: Array, assist: float) -> LawOutput:
     """Return the law's output at rest at a pose, once all of the assist is given."""
     for _ in range(2000):
-        if law.align(q, STILL, assist, DT).assist == assist:
-            return law.align(q, STILL, assist, 0.0)
+        if law.align(q, assist).assist == assist:
+            return law.align(q, assist, dt=0.0)
     raise AssertionError("the assist never came")
 
 
@@ -348,7 +348,7 @@ def torque_of(law: Law) -> Callable[[Array, Array], Array]:
 def test_it_feels_like_k_p_where_it_balances_or_free(posed: Array) -> None:
     """With the real S, references moving: -dQ/dp = (K_fail + K_c) S_perp, Q all forces."""
     law = Law()
-    law.align(posed, STILL, 0.0, 0.0)
+    law.align(posed, dt=0.0)
     total, q_of = torque_of(law), oracle.closed_chain(ROBOT, posed)
 
     def felt(p: Array) -> Array:
@@ -373,7 +373,7 @@ def test_it_feels_like_k_p_where_it_balances_or_free(posed: Array) -> None:
 @pytest.mark.usefixtures("exact_ik")
 def test_motion_is_damped_where_it_balances_or_free(posed: Array) -> None:
     law = Law()
-    law.align(posed, STILL, 0.0, 0.0)
+    law.align(posed, dt=0.0)
     total, T = torque_of(law), oracle.feasible(ROBOT, posed)
     slope = oracle.derivative(lambda pdot: T.T @ total(posed, T @ pdot), np.zeros(6), 1e-4)
     S_perp = np.diag(1.0 - np.array(ROBOT.law.S))
