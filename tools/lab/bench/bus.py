@@ -1,8 +1,6 @@
 """`xrl bench bus`: the fleet's pattern of messages over every transport that is installed.
 
-Six modules and a planner, each a process at the services' rates and priority, without laws and
-drives. A module publishes a state in every other cycle and takes the newest command in each. The
-planner publishes six commands once six new states are there.
+Six modules and a planner, each a process at the services' rates and priority, without their laws.
 """
 
 from __future__ import annotations
@@ -45,13 +43,11 @@ dds, dds_domain, dds_topic, pub, sub, idl, dds_types = (late(f"cyclonedds.{p}") 
 
 Put = Callable[[bytes], object]
 Take = Callable[[], "bytes | None"]
-"""Returns the newest payload if it was not taken before. Neither blocks."""
 End = tuple[Callable[[str], Put], Callable[[str], Take]]
-"""One process's end: how to send on a key, and how to take from one."""
+"""One process's end: how to put on a key, and to take its newest payload once; neither blocks."""
 
 CYCLE_NS, TICK_NS, POLL_NS = 2_000_000, 4_000_000, 400 * NS_PER_US
-WARM_UP_S: Final = 1.5
-"""Time until all links are there; nothing of it is counted."""
+WARM_UP_S: Final = 1.5  # until all links are there; not counted
 PLANNER: Final = "planner"
 MESSAGE: Final = struct.Struct("q440x")
 """The time at which it was put; as long as the fleet's states and commands."""
@@ -199,7 +195,7 @@ commands that a cycle missed which could have taken them, and CPU time as a frac
 
 
 def run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[float], int]:
-    """Run a module's cycles; count from `begin_ns` on."""
+    """Put a state in every other cycle, take the newest command in each; count from `begin_ns`."""
     put, take = end[0](f"state_{name}"), end[1](f"command_{name}")
     latencies, missed = list[float](), 0
     due, before_ns, cycle = time.monotonic_ns(), 0, 0
@@ -219,7 +215,7 @@ def run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[fl
 
 
 def run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[float], int]:
-    """Run the planner's ticks."""
+    """Put six commands once six new states are there."""
     takes = [end[1](f"state_{module}") for module in MODULES]
     puts = [end[0](f"command_{module}") for module in MODULES]
     fresh, last_ns = set[int](), 0
@@ -285,10 +281,9 @@ def run(flags: BusFlags) -> int:
     names = flags.transport or [
         name for name, (_, package) in TRANSPORTS.items() if importlib.util.find_spec(package)
     ]
-    console = Console()
     rounds = [
         [measure(name, flags.seconds) for name in names]
-        for _ in track(range(flags.rounds or 3), "measuring", console=console, transient=True)
+        for _ in track(range(flags.rounds or 3), "measuring", transient=True)
     ]
     rows = [
         {"transport": name} | {key: median(one[key] for one in column) for key in column[0]}
@@ -296,7 +291,7 @@ def run(flags: BusFlags) -> int:
     ]
     columns = {key: [f"{row[key]:.2f}" for row in rows] for key in rows[0] if key != "transport"}
     print_table(
-        console,
+        Console(),
         {"": list(names)} | columns,
         "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. Missed: a "
         "command came a cycle later than it could have. CPU: of all processes, of one core.",

@@ -57,8 +57,8 @@ class _Done(NamedTuple):
 
 def cores() -> int:
     """Return the number of worker processes to use: one a core, or one without joblib."""
-    has_joblib = importlib.util.find_spec("joblib") is not None
-    return len(os.sched_getaffinity(0)) if has_joblib else 1
+    count = len(os.sched_getaffinity(0))
+    return min(count, 1) if importlib.util.find_spec("joblib") is None else count
 
 
 @cache
