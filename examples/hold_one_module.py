@@ -27,9 +27,10 @@ def main() -> None:
         elif step.target is not None:
             drive.write(step.target)
         if step.event is not None or cycle % 250 == 249:
-            state = knee.controller.state(drive.now_ns)
+            now = knee.state.controller
+            state = knee.controller.state(now, drive.now_ns)
             print(
-                f"{cycle / 500:5.2f} s  {knee.controller.failsafe.mode.name:8}"
+                f"{cycle / 500:5.2f} s  {now.failsafe.mode.name:8}"
                 f"  theta {state.q[1]:8.4f} rad  torque {state.tau[1]:7.2f} N m"
             )
 

@@ -1,4 +1,4 @@
-"""A squat held until a motor is nearly too warm: the robot stands up by itself."""
+"""Heat and supply at their end: the robot stands up, or goes down, by itself and in time."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import pytest
 from services.joint.differential import motor_torque
 from services.joint.heat import HeatEstimate
 from services.planner.law.kinematics import Kinematics
-from shared.bus.messages import LEFT_MAX_S, HeatAction, PlannerMode
+from shared.bus.messages import LEFT_MAX_S, HeatAction, Mode, PlannerMode
 from shared.bus.traces import SimTruth
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.robot_model import stand_pose
-from tests.lockstep.runs import led_to, standing_as, status_of
+from tests.lockstep.runs import led_to, modes_of, run, standing_as, status_of, still
+from tests.robots import ROBOT
+from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import FleetMoment, Lockstep
 
 HELD_S = 5.5
@@ -45,7 +47,7 @@ def hold(
             fleet.world.let_go()
         if skips and row.scenario_s > HELD_S:
             skips = False
-            while min(law.heat.state.left_s for law in fleet.controllers) > 33.0:
+            while min(law.heat.left_s for law in fleet.controllers) > 33.0:
                 fleet.skip_heat(1.0)
         actions.append(status_of(fleet).heat)
         derating = min(derating, fleet.bank.heat.derating)
@@ -68,7 +70,7 @@ def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
     assert status.mode == PlannerMode.LEADING
     assert status.heat_left_s > 60.0
     assert max(abs(1e3 * row.com[0]) for row in held.rows) < 15.0
-    assert max(law.heat.state.winding[0] for law in held.fleet.controllers) < 100.0
+    assert max(law.heat.winding[0] for law in held.fleet.controllers) < 100.0
 
 
 def test_without_an_estimate_nothing_is_said_and_nothing_done(robot: RobotConfig) -> None:
@@ -103,7 +105,44 @@ def test_a_pose_can_be_held_as_long_as_the_results_say(
         for phi, theta in tau.reshape(-1, 2).tolist():
             estimate = HeatEstimate(day)
             a, b = motor_torque((phi, theta), robot.joint.gear_ratio)
-            estimate.state.load = (a * a, b * b)
-            estimate.skip(0.0)
-            left.append(estimate.state.left_s)
+            state = estimate.cold()
+            state.load = (a * a, b * b)
+            estimate.skip(state, 0.0)
+            left.append(state.left_s)
         assert min(left) / 60.0 == pytest.approx(expected, rel=0.02, abs=0.06)
+
+
+# ---- a battery that runs low: told, then down, before the drives disarm
+
+FALL_V_S = 0.4
+"""How fast the supplies fall: far faster than a battery's end."""
+BEGINS_V, UNDERVOLTAGE_V = 45.0, 38.0
+
+
+@pytest.mark.sampled(8)
+@pytest.mark.parametrize("number", range(8))
+def test_it_is_told_and_the_robot_is_down_before_the_drives_disarm(number: int) -> None:
+    told: dict[str, float] = {}
+
+    def empties(fleet: Lockstep, row: SimTruth) -> bool:
+        bus = fleet.bank.bus
+        fleet.bank.settings.fill("config.dc_bus_undervoltage_trip_level", UNDERVOLTAGE_V)
+        bus.supply = np.minimum(bus.supply, BEGINS_V) - 0.01 * FALL_V_S
+        bus.changed()
+        why = status_of(fleet).why
+        if "change the battery" in why:
+            told.setdefault("low", row.scenario_s)
+        if "put a stand" in why:
+            told.setdefault("sits", row.scenario_s)
+        if row.torso[2] < 0.86:
+            told.setdefault("down", row.scenario_s)
+        return {*modes_of(fleet)} != {Mode.TRACK} and "down" in told
+
+    scenario = msgspec.structs.replace(still(40.0), hand=False)
+    plant = plants.draw(f"battery {number}")
+    outcome = run(ROBOT, scenario, plant=plant, each=empties)
+    disarmed = outcome.rows[-1].scenario_s
+    assert told["low"] < told["sits"] - 2.0
+    assert told["down"] < disarmed - 2.0
+    assert outcome.rows[-1].torso[2] < 0.86
+    assert not outcome.rows[-1].fallen

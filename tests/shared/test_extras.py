@@ -82,9 +82,8 @@ def test_locks_hold_what_their_extras_say_and_the_page_counts_them() -> None:
         row = next(line for line in page.splitlines() if line.startswith(f"| `{extra}` |"))
         assert f"| {count} |" in row
     held = locked("requirements.lock")
-    for extra in set(EXTRAS) - {*UNLOCKED, "pad"}:
+    for extra in set(EXTRAS) - UNLOCKED:
         assert packages_of(extra) <= held, extra
-    assert "evdev-binary" in held
 
 
 @pytest.mark.parametrize("extra", sorted(ON_ROBOTS))

@@ -99,7 +99,8 @@ class AssistLaw:
     no request the integral decays to zero with the same time constant. It never takes the assist
     below zero: the robot does not pull the operator down.
 
-    Stability: `integral_s_min`.
+    Stable in the loop with a hand of stiffness k and damping b, without delay, if integral_s is
+    above m / b - b / k for a robot of mass m (docs/law.md#harness).
     """
 
     def __init__(self, config: AssistConfig) -> None:
@@ -158,7 +159,8 @@ class LeadEasing:
     the Jacobian of the harness point, not of the COM. It belongs in tau_coupled, which HOLD drops;
     in tau_ff it would outlive the hand.
 
-    Stability: `alpha_max`.
+    Stable if alpha |G(j w)| < 1 wherever the phase of G, the hand's force by the robot's, is -180
+    degrees: up to an alpha above 5 for the simulated hand (docs/law.md#harness).
     """
 
     def __init__(self, alpha: float) -> None:
