@@ -75,7 +75,7 @@ def test_locks_hold_what_their_extras_say_and_the_page_counts_them() -> None:
     assert {distribution(requirement) for requirement in PROJECT["dependencies"]} <= held
     assert held & set().union(*(packages_of(extra) for extra in EXTRAS)) == set()
     page = (ROOT / "docs" / "security.md").read_text(encoding="utf-8")
-    assert f"{len(locked('requirements.runtime.lock'))} packages, 0.9 GB" in page
+    assert f"{len(locked('requirements.runtime.lock'))} packages, 0.8 GB" in page
     for extra in ON_ROBOTS:
         lines = locked_lines(f"requirements.{extra}.lock")
         count = sum("; sys_platform == 'win32'" not in line for line in lines)
