@@ -182,6 +182,7 @@ class Pendant:
         self._beats = 0
         for module in modules:
             with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
+                file.truncate(len(_NEW))  # a service that starts now has not sized it yet
                 self._memories[module] = mmap.mmap(file.fileno(), len(_NEW))
 
     @property

@@ -145,7 +145,7 @@ def test_a_pendant_reaches_the_services_that_run(tmp_path: Path, file: RearmGuar
     assert (file.beats, other.beats) == (0, 0)
 
 
-def test_a_pendant_reaches_a_service_through_a_file_older_than_pendants(tmp_path: Path) -> None:
+def test_a_pendant_reaches_a_service_whose_file_has_not_its_size_yet(tmp_path: Path) -> None:
     make_live_dir(tmp_path)
     path_of(tmp_path, MODULE).write_bytes(bytes([LastState.HELD, 0]))
     Pendant(tmp_path, MODULES).beat()

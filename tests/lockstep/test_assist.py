@@ -209,7 +209,7 @@ def carry(fail: Callable[[HarnessFront, float], None]) -> tuple[Run, list[str]]:
 
     def look(fleet: Lockstep, row: SimTruth) -> None:
         if row.scenario_s >= FAILS_S:
-            fail(fleet.harness._front, row.scenario_s - FAILS_S)
+            fail(fleet.harness._robot.harness, row.scenario_s - FAILS_S)
             said.append(status_of(fleet).why)
 
     scenario = led_to((2.0, 1.0, 0.0, ASSIST_N), duration=FAILS_S + 9.0)

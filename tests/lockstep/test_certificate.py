@@ -121,12 +121,12 @@ def grows(robot: RobotConfig, design: Design, stiffness: float, delay_ms: float)
             taken_over = True
             assert fleet.planner is not None
             other = Planner(with_design(robot, design), fleet.planner.session)
-            other.restore(fleet.planner.snapshot())
+            other.state = fleet.planner.state
             fleet.planner = other
         if row.fallen or (taken_over and set(modes_of(fleet)) != {Mode.TRACK}):
             return True
         if row.scenario_s > 3.5:
-            squares.append(float(np.mean([np.square(c.samples.v) for c in fleet.controllers])))
+            squares.append(float(np.mean([np.square(c.estimate.v) for c in fleet.controllers])))
     return math.sqrt(np.mean(squares)) > 0.1
 
 

@@ -189,7 +189,11 @@ def test_a_power_cut_while_arming_leaves_no_request_behind(after_ms: int) -> Non
 
 def stiffened(outcome: Run) -> list[str]:
     """Return the modules that hold with all they have."""
-    states = [each.state(outcome.lockstep.now_ns) for each in outcome.lockstep.controllers]
+    fleet = outcome.lockstep
+    states = [
+        joint.manager.controller.state(joint.manager.state.controller, fleet.now_ns)
+        for joint in fleet.joints
+    ]
     return [name for name, state in zip(MODULES, states, strict=True) if state.stiffened]
 
 

@@ -101,7 +101,7 @@ class Fleet:
         """Run; return how many track after each cycle."""
         tracking = []
         for _ in range(cycles):
-            states = [bench.controller.state(bench.now_ns) for bench in self.benches]
+            states = [bench.law.state(bench.controller, bench.now_ns) for bench in self.benches]
             self.engagement.advance(
                 self.benches[0].now_ns, YES, [s.ready for s in states], [s.mode for s in states]
             )

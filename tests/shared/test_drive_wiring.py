@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.joint.drive_setpoint import GAIN_UPDATE_MIN_MS, DriveSetpointLaw
+from services.joint.drive_setpoint import GAIN_UPDATE_MIN_MS, DriveGains, DriveSetpointLaw
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy
 from services.joint.pd_law import ZERO, Setpoint
 from services.simulator.drives.axis_settings import (
@@ -270,13 +270,15 @@ def is_at_limit(load: BusLoad, rate_hz: float) -> bool:
 def test_a_blend_sends_gains_no_more_often_than_planned() -> None:
     """As the law of the drives' own loops changes them, and as they are told over CAN."""
     rate_hz, blend_s = 500.0, 0.3
-    law, due = DriveSetpointLaw(17.5, 60.0), ResendPolicy()
+    law, gains, due = DriveSetpointLaw(17.5, 60.0), DriveGains(), ResendPolicy()
     due.armed(0)
     sent, cycles = 0, round(blend_s * rate_hz)
     for cycle in range(1, cycles + 1):
         now_ns, done = round(cycle * 1e9 / rate_hz), cycle / cycles
         k_p, k_d = (900.0 * done, 600.0 * (1.0 - done)), (60.0 * done, 20.0)
-        target = law.target(now_ns, Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, k_d), ZERO, ZERO, ZERO)
+        target = law.target(
+            gains, now_ns, Setpoint(ZERO, ZERO, ZERO, ZERO, k_p, k_d), ZERO, ZERO, ZERO
+        )
         sent += due.with_target((target.pos_gain, target.vel_gain), now_ns) is not GainRow.INPUTS
     assert 0.9 * blend_s * BLEND_HZ <= sent <= blend_s * BLEND_HZ + 2, "the first two at once"
     assert BLEND_HZ == 1e3 / GAIN_UPDATE_MIN_MS

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.joint.differential import joint_torque, motor_from_joint
-from services.joint.drive_setpoint import DriveSetpointLaw
+from services.joint.drive_setpoint import DriveGains, DriveSetpointLaw
 from services.joint.drivers.base import MotorTarget
 from services.joint.drivers.frame_times import ARM_GRACE_MS, INSIST_MS, REBOOT_MS
 from services.joint.drivers.odrive_can import OdriveCan
@@ -142,7 +142,7 @@ def test_arming_onboard_holds_the_positions_without_gains(rig: Rig, shed: Shed) 
 def test_either_loop_gives_the_joint_the_same_torque(rig: Rig, driver: OdriveCan) -> None:
     """Over the wire, in the emulated firmware: thousandths of a newton metre at the motor."""
     arm(rig, driver, onboard=True)
-    law = DriveSetpointLaw(N, DRIVE.vel_limit)
+    law, gains = DriveSetpointLaw(N, DRIVE.vel_limit), DriveGains()
     dice = np.random.default_rng(3)
     for _ in range(30):
         q = dice.uniform(-0.3, 0.3, 2)
@@ -160,7 +160,12 @@ def test_either_loop_gives_the_joint_the_same_torque(rig: Rig, driver: OdriveCan
         tau = tuple(dice.uniform(-50.0, 50.0, 2))
         driver.write(
             law.target(
-                reading.t_ns, setpoint, (tau[0], tau[1]), reading.pos_turns, reading.vel_turns
+                gains,
+                reading.t_ns,
+                setpoint,
+                (tau[0], tau[1]),
+                reading.pos_turns,
+                reading.vel_turns,
             )
         )
         rig.front.receive()

@@ -137,7 +137,9 @@ def test_the_plant_has_the_simulated_world_s_modes(robot: RobotConfig) -> None:
     for _ in range(2000):
         fleet.advance()
     world = fleet.world
-    simulated = modes(simulated_transition(world, fleet._torque.copy()), world.model.opt.timestep)
+    simulated = modes(
+        simulated_transition(world, fleet._robot._torque.copy()), world.model.opt.timestep
+    )
     stand = linearised(robot, world.actuation.flexible.theta)
     nothing = np.zeros((12, 12))
     drivetrain = DrivetrainModel(5000.0, 10.0, 0.15)
