@@ -186,6 +186,8 @@ def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
     """They keep a robot standing, and nothing but a person may end that."""
     fleet = start({"planner": STUBBORN, "harness": SLEEPER})
     pids = fleet.pids()
+    for name in pids:  # its first words into a pipe that nobody reads would end it
+        assert wait_for(lambda name=name: "awake" in fleet.run.log_of(name).read_text())
     os.kill(supervisor_pid(fleet), signal.SIGKILL)
     assert wait_for(lambda: bool(fleet.supervision_fault()))
     assert [row.state for row in fleet.info()] == ["unsupervised", "unsupervised"]
