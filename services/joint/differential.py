@@ -46,7 +46,7 @@ def joint_torque(motor: Pair, gear_ratio: float) -> Pair:
 
 
 class TorqueLimits(msgspec.Struct, frozen=True):
-    """What one module's torque limiter allows."""
+    """Limits of one module's torque."""
 
     phi: Pair
     """Soft stops (low, high) in rad."""

@@ -97,7 +97,7 @@ _NO_INHIBIT: Final = ArmingInhibit.NONE
 
 
 class Phase(Enum):
-    """What this service has to do with the drive's power."""
+    """Relation of this service to the power of its drive."""
 
     NEW = 0
     """It has not acted yet: if the drive is armed, another service armed it."""

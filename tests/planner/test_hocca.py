@@ -14,6 +14,7 @@ from services.planner.law.kinematics import Kinematics
 from services.planner.law.reference import Reference
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
+from shared.state import copied
 from tests.planner import oracle
 from tests.planner.oracle import LEFT, RIGHT
 from tests.planner.states import DT, LIMITS, ROBOT, STILL, Law, at_pose, closed, with_law
@@ -469,3 +470,16 @@ def test_of_nan_nothing_is_found_but_the_next_is() -> None:
     reference.load(np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(3), there.D_left)
     assert reference.solve(start, there.p).converged
     np.testing.assert_allclose(reference.q, q, atol=1e-6)
+
+
+def test_a_law_that_is_continued_closes_height_and_pitch_as_the_one_before_it() -> None:
+    """How far the height's reference may lead follows from the last tick's joint rates."""
+    law, twin, q, v = Law(), Law(), closed(1.25), np.full(12, 0.1)
+    law.align(q)
+    law.tick(q, v)
+    twin.state = copied(law.state)
+    assert twin.state.height.T_z == np.abs(law.hocca.reference.T[:, 2]).max() > 5.0
+    for _ in range(3):
+        one, other = (each.tick(q, v, released=(True, True)) for each in (law, twin))
+        np.testing.assert_array_equal(one.tau_ff, other.tau_ff)
+        np.testing.assert_array_equal(one.q_ref, other.q_ref)

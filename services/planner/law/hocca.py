@@ -213,8 +213,7 @@ class Hocca:
         ease_z, ease_pitch = self._easing.ease(s.easing, force, moment_pitch, assist, dt)
         tau_coupled += ease_z * reference.J_harness[2] + ease_pitch * reference.J[4]
         s.q = tuple(reference.expected(dt).tolist())
-        if s.height.is_active:
-            s.height.T_z = float(np.abs(reference.T[:, 2]).max())
+        s.height.T_z = float(np.abs(reference.T[:, 2]).max())
         return LawOutput(
             q_ref=reference.q.copy(),
             v_ref=reference.v.copy(),

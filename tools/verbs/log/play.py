@@ -48,15 +48,15 @@ ABOUT: Final = f"""
 Messages go out in the order and at the times at which the recorder had them, byte for byte: t_ns
 and every other stamp in them is that of the recording. Late messages go at once.
 
-Key xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, to which no service subscribes. The player dials
-nobody: it has a bus of its own. Subscribers dial the player at --listen:
+Key xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, to which no service subscribes. The player has a
+bus of its own and connects to no peer. Subscribers connect to the player at --listen:
   open_session(robot, "mine", run_dir, connect=["{LISTEN}"])
   .stream(["{PREFIX}/**"])
 or any Zenoh 1.x peer or client that connects there.
 
 Exit code: 0 played; 2 refused, messages could not be sent, or a subscriber that took nothing for
 5 s was dropped; 130 Ctrl-C. A subscriber that links later misses earlier messages: the summary
-says how many messages nobody received.
+reports how many messages had no subscriber.
 """
 
 
