@@ -138,7 +138,7 @@ def test_a_node_of_another_finds_the_robot_reads_it_all_leads_it_a_little_and_st
             assert wait_for(lambda: _says(node, "knee_left", "TRACK"))
             assert _says(node, "planner", "LEADING")
 
-            found = xrl("ros2", "check", *asked)
+            found = xrl("ros2", "check", *asked, "--wait", "30")
             assert found.returncode == 0, found.stdout
             assert "12 of 12 joints" in found.stdout
 

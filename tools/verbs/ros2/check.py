@@ -30,7 +30,7 @@ xrl ros2 check --domain 7 --router tcp/192.168.0.2:7447
 """
 LOOK_S: Final = 0.1
 LISTEN_S: Final = 2.0
-"""Long enough for a message of `/diagnostics`."""
+"""Shortest listening, over which messages are counted."""
 
 
 def _domain_here() -> int:
@@ -50,7 +50,7 @@ class CheckFlags(ConfigFlags):
     router: Annotated[str | None, Arg(metavar="ENDPOINT")] = None
     """router (default: ros2.router of the robot file)"""
     wait: Seconds = 5.0
-    """longest wait for router and node"""
+    """longest wait for the router, for the node, and for each topic's first message"""
 
 
 def run(flags: CheckFlags) -> int:
@@ -108,7 +108,7 @@ def look(robot: RobotConfig, domain: int, wait_s: float) -> list[CheckRow]:
             if _has_rate(topic, known, robot)
         ]
         steady = [topic for topic in shown if topic != known.description]
-        rows += _received(ros, steady, known, ros2.diagnostics_hz or 1.0)
+        rows += _received(ros, steady, known, max(wait_s, 3.0 / (ros2.diagnostics_hz or 1.0)))
         others = [node for node in nodes if node != name]
         return [*rows, CheckRow(True, "other nodes", ", ".join(others) or "none")]
 
@@ -143,15 +143,16 @@ def _missing(topic: RosTopic, seen: list[SeenEndpoint]) -> CheckRow:
 
 
 def _received(
-    ros: RosSession, topics: list[RosTopic], known: RosTopics, slowest_hz: float
+    ros: RosSession, topics: list[RosTopic], known: RosTopics, wait_s: float
 ) -> list[CheckRow]:
-    """Receive long enough for the slowest; return a row for each topic."""
-    listen_s = max(LISTEN_S, 1.5 / slowest_hz)
+    """Count what arrives, and wait up to `wait_s` for a slow topic's first message."""
     ros.subscribe(topics)
     counts = dict.fromkeys(topics, 0)
     joints: list[str] = []
     began = time.monotonic()
-    while time.monotonic() - began < listen_s:
+    while (heard_s := time.monotonic() - began) < LISTEN_S or (
+        heard_s < wait_s and not all(counts.values())
+    ):
         for topic, message in ros.take():
             counts[topic] += message is not None
             if topic == known.joint_states and message is not None:
@@ -159,7 +160,7 @@ def _received(
         time.sleep(LOOK_S / 4)
     rows = []
     for topic, count in counts.items():
-        found = f"{count} messages in {listen_s:.1f} s"
+        found = f"{count} messages in {heard_s:.1f} s"
         if topic == known.joint_states:
             found += f", {len(joints)} of {len(JOINTS)} joints"
         good = count > 0 and (topic != known.joint_states or len(joints) == len(JOINTS))
