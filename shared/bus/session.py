@@ -18,6 +18,7 @@ import json
 import os
 import re
 import socket
+import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -115,7 +116,8 @@ class Publisher(Generic[T]):
 
         Never blocks and never raises. Where a subscriber's queue is full the message is
         dropped for that subscriber only, and that is not counted. The first message that cannot be
-        encoded is logged, with its field: a bug of whoever made it, not a fault of the robot.
+        encoded is a bug of the sender; a thread logs it with its field, because a log line may
+        block.
         """
         try:
             self._put(self._encoded(message))
@@ -126,7 +128,8 @@ class Publisher(Generic[T]):
             self.failed += 1
             if not self._has_reported:
                 self._has_reported = True
-                log.get("xrl").error("%s", error)
+                line = ("%s", str(error))
+                threading.Thread(target=log.get("xrl").error, args=line, daemon=True).start()
             return False
         return True
 

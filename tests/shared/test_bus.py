@@ -280,7 +280,9 @@ def ankle(run_dir: Path) -> Iterator[Ankle]:
         yield planner, publisher, commands
 
 
-def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(ankle: Ankle) -> None:
+def test_number_that_is_not_finite_is_refused_counted_and_logged_once_by_the_sender(
+    ankle: Ankle, caplog: pytest.LogCaptureFixture
+) -> None:
     _, publisher, commands = ankle
     assert publisher.failed == 0
     for bad in (math.nan, math.inf, -math.inf):
@@ -289,6 +291,8 @@ def test_number_that_is_not_finite_is_refused_and_counted_by_the_sender(ankle: A
     assert publisher.put(command(2))
     assert comes_true(lambda: (came := commands.take()) is not None and came.seq == 2)
     assert commands.refused == 0
+    assert comes_true(lambda: len(caplog.records) == 1)
+    assert "JointCommand 1" in caplog.text
 
 
 @pytest.mark.parametrize("bad", [b'{"t_ns":0,"seq":1,"q_ref":[null,0.0]}', b"no json", b""])
