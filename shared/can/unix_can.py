@@ -27,7 +27,7 @@ import struct
 import termios
 import time
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -43,7 +43,10 @@ Frame = tuple[int, bytes]
 """SocketCAN id with its flags, and up to eight data bytes."""
 
 _FRAME = struct.Struct("<IB3x8s")
-PACKET_BYTES: Final = 64 * _FRAME.size
+FRAME_BYTES: Final = _FRAME.size
+pack_frame: Final = _FRAME.pack
+"""Pack id with flags, number of data bytes, and data."""
+PACKET_BYTES: Final = 64 * FRAME_BYTES
 """Longest packet that either side sends."""
 _DRAIN = 1024  # packets in one call: more than a socket holds
 FRAME_TRUESIZE: Final = 768
@@ -57,15 +60,17 @@ def pack_frames(frames: Iterable[Frame]) -> bytes:
 
 def unpack_frames(packet: bytes) -> list[Frame]:
     """Return the frames of a packet; none if it is not a whole number of frames."""
-    if len(packet) % _FRAME.size:
+    if len(packet) % FRAME_BYTES:
         return []
     return [(can_id, data[:length]) for can_id, length, data in _FRAME.iter_unpack(packet)]
 
 
+FULL_AT: Final = 4
+"""Place of `Interface.full` in its memory."""
+
+
 class Interface:
     """State of an emulated CAN interface, in memory that the hub and its clients share."""
-
-    _FULL = 4
 
     def __init__(self, channel: str | os.PathLike[str], *, create: bool = False) -> None:
         """Open the state of the interface with this socket; the hub creates it.
@@ -80,33 +85,33 @@ class Interface:
         descriptor = os.open(self.path, flags, 0o600)
         try:
             if create:
-                os.ftruncate(descriptor, self._FULL + 1)
-            self._memory = mmap.mmap(descriptor, self._FULL + 1)
+                os.ftruncate(descriptor, FULL_AT + 1)
+            self.memory = mmap.mmap(descriptor, FULL_AT + 1)
         finally:
             os.close(descriptor)
 
     @property
     def full(self) -> bool:
         """True while the send queue (txqueuelen) takes no frame: ENOBUFS."""
-        return self._memory[self._FULL] != 0
+        return self.memory[FULL_AT] != 0
 
     @full.setter
     def full(self, full: bool) -> None:
-        self._memory[self._FULL] = full
+        self.memory[FULL_AT] = full
 
     @property
     def restarts(self) -> int:
         """How often the interface was taken down and up: each empties its queue."""
-        return int.from_bytes(self._memory[: self._FULL], "little")
+        return int.from_bytes(self.memory[:FULL_AT], "little")
 
     def restart(self) -> None:
         """Ask the hub to throw away all frames that wait."""
         count = self.restarts + 1 & 0xFFFF_FFFF
-        self._memory[: self._FULL] = count.to_bytes(self._FULL, "little")
+        self.memory[:FULL_AT] = count.to_bytes(FULL_AT, "little")
 
     def close(self) -> None:
         """Release the memory."""
-        self._memory.close()
+        self.memory.close()
 
 
 class UnixCanBus(can.BusABC):
@@ -127,8 +132,8 @@ class UnixCanBus(can.BusABC):
     ) -> None:
         """Connect to the hub that listens on path `channel`, or can.CanInitializationError.
 
-        With `receive_own_messages`, `recv_many` returns this client's own frames too, once the bus
-        has carried them (CAN_RAW_RECV_OWN_MSGS).
+        With `receive_own_messages`, `carried` returns this client's own frames once the bus has
+        carried them (as CAN_RAW_RECV_OWN_MSGS does).
         """
         self.dropped = 0
         self.channel_info = f"xrl_unix {channel}"
@@ -142,49 +147,62 @@ class UnixCanBus(can.BusABC):
         super().__init__(channel, can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
-        """Send one frame without waiting, whatever `timeout` says; as `send_many`."""
-        self.send_many((msg,))
-
-    def send_many(self, messages: Sequence[can.Message]) -> None:
-        """Send frames in one packet without waiting.
+        """Send one frame without waiting, whatever `timeout` says.
 
         Raises:
             can.CanOperationError: there is no room (ENOBUFS), or the hub is gone.
         """
-        if self._interface.full:
-            raise self._no_room(messages)
-        packet = b"".join(
-            [
-                _FRAME.pack(_can_id(message), message.dlc, bytes(message.data))
-                for message in messages
-            ]
-        )
-        try:
-            self.socket.send(packet, socket.MSG_DONTWAIT)
-        except BlockingIOError:
-            raise self._no_room(messages) from None
-        except OSError as error:
-            raise can.CanOperationError(f"{self.channel_info}: {error}", error.errno) from error
-        if self._echoes:
-            self._uncarried.append(packet)
+        if not self.send_packet(pack_frame(_can_id(msg), msg.dlc, bytes(msg.data))):
+            raise can.CanOperationError(
+                f"{self.channel_info}: {os.strerror(errno.ENOBUFS)}", errno.ENOBUFS
+            )
 
-    def recv_many(self, timeout: float) -> list[Frame]:
-        """Wait for a packet and return the frames of all packets that are there, in order.
+    def send_packet(self, packet: bytes) -> int:
+        """Send packed frames without waiting; return how many bytes went: all of them, or 0.
+
+        The fast path around `can.Message`. A hub that is gone shows in receiving.
+        """
+        if not self._interface.memory[FULL_AT]:
+            try:
+                self.socket.send(packet, socket.MSG_DONTWAIT)
+            except OSError:
+                pass
+            else:
+                if self._echoes:
+                    self._uncarried.append(packet)
+                return len(packet)
+        self.dropped += len(packet) // FRAME_BYTES
+        return 0
+
+    def recv_packet(self, timeout: float) -> bytes:
+        """Wait for a packet and return all packets that are there as one, in order.
 
         The fast path around `can.Message`; filters are not applied. Empty after `timeout` seconds.
         Raises can.CanOperationError once the hub is gone.
         """
         packet = self._receive(timeout)
-        frames = self._carried() if self._uncarried else []
         if packet is None:
-            return frames
-        frames += unpack_frames(packet)
+            return b""
         for _ in range(_DRAIN):
-            packet = self._receive(0.0)
-            if packet is None:
+            more = self._receive(0.0)
+            if more is None:
                 break
-            frames += unpack_frames(packet)
-        return frames
+            packet += more
+        return packet
+
+    def carried(self) -> bytes:
+        """Return own frames that the bus has carried since the last call.
+
+        Empty without `receive_own_messages`.
+        """
+        if not self._uncarried:
+            return b""
+        waiting = struct.unpack("i", fcntl.ioctl(self.socket, termios.TIOCOUTQ, bytes(4)))[0]
+        packets = -(-waiting // FRAME_TRUESIZE)
+        carried = b""
+        while len(self._uncarried) > packets:
+            carried += self._uncarried.popleft()
+        return carried
 
     def restart(self) -> None:
         """Take the interface down and up: what waits is thrown away, of every client."""
@@ -201,21 +219,6 @@ class UnixCanBus(can.BusABC):
         self.socket.close()
         self._interface.close()
 
-    def _carried(self) -> list[Frame]:
-        """Return own frames that the hub has taken since the last call."""
-        waiting = struct.unpack("i", fcntl.ioctl(self.socket, termios.TIOCOUTQ, bytes(4)))[0]
-        packets = -(-waiting // FRAME_TRUESIZE)
-        frames: list[Frame] = []
-        while len(self._uncarried) > packets:
-            frames += unpack_frames(self._uncarried.popleft())
-        return frames
-
-    def _no_room(self, messages: Sequence[can.Message]) -> can.CanOperationError:
-        self.dropped += len(messages)
-        return can.CanOperationError(
-            f"{self.channel_info}: {os.strerror(errno.ENOBUFS)}", errno.ENOBUFS
-        )
-
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         """Return the next frame as python-can asks for it; filters are left to python-can."""
         if not self._waiting:
@@ -227,7 +230,7 @@ class UnixCanBus(can.BusABC):
         return (self._waiting.popleft() if self._waiting else None), False
 
     def _receive(self, timeout: float | None) -> bytes | None:
-        """Return a packet, or None when `timeout` seconds have brought none.
+        """Return a packet of whole frames, or None when `timeout` seconds have brought none.
 
         The kernel keeps the time (SO_RCVTIMEO): one system call instead of two.
         """
@@ -245,7 +248,7 @@ class UnixCanBus(can.BusABC):
             raise can.CanOperationError(f"{self.channel_info}: {error}") from error
         if not packet:
             raise can.CanOperationError(f"{self.channel_info}: the hub has closed")
-        return packet
+        return b"" if len(packet) % FRAME_BYTES else packet
 
 
 def _can_id(message: can.Message) -> int:

@@ -31,7 +31,7 @@ from shared.can.cansimple_06 import (
     Version,
 )
 from shared.can.interface import QUEUED_MAX, limit_queue, restart
-from shared.can.unix_can import REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
+from shared.can.unix_can import FRAME_BYTES, REMOTE_FLAG, UnixCanBus, pack_frames, unpack_frames
 from shared.exceptions import FleetError
 
 float32 = st.floats(width=32, allow_nan=False)
@@ -167,8 +167,8 @@ def test_frames_go_to_the_other_clients_only_in_socketcans_layout(hub: UnixCanHu
     with connect(hub) as sender, connect(hub) as listener:
         sender.send(message(5, b"x"))
         assert hub.poll() == [(5, b"x")]
-        assert listener.recv_many(1.0) == [(5, b"x")]
-        assert sender.recv_many(0.0) == []
+        assert unpack_frames(listener.recv_packet(1.0)) == [(5, b"x")]
+        assert sender.recv_packet(0.0) == b""
 
 
 def test_python_can_finds_the_interface_by_its_name(hub: UnixCanHub) -> None:
@@ -210,9 +210,9 @@ def test_all_frames_of_all_packets_arrive_in_order_either_way(
     with connect(hub) as bus:
         for packet in packets:
             hub.broadcast(packet)
-            bus.send_many([message(*frame) for frame in packet])
-        assert bus.recv_many(1.0) == hub.poll() == frames
-        assert bus.recv_many(0.0) == hub.poll() == []
+            bus.send_packet(pack_frames(packet))
+        assert unpack_frames(bus.recv_packet(1.0)) == hub.poll() == frames
+        assert unpack_frames(bus.recv_packet(0.0)) == hub.poll() == []
 
 
 def test_client_that_does_not_read_neither_blocks_the_hub_nor_the_others(hub: UnixCanHub) -> None:
@@ -220,10 +220,10 @@ def test_client_that_does_not_read_neither_blocks_the_hub_nor_the_others(hub: Un
         received = 0
         for _ in range(5000):
             hub.broadcast([(1, bytes(8))])
-            received += len(reader.recv_many(0.0))
+            received += len(reader.recv_packet(0.0)) // FRAME_BYTES
         assert received == 5000
         assert hub.dropped > 0
-        assert len(stopped.recv_many(0.0)) == 5000 - hub.dropped
+        assert len(stopped.recv_packet(0.0)) == FRAME_BYTES * (5000 - hub.dropped)
 
 
 def fill(bus: UnixCanBus, frames: int) -> None:
@@ -250,7 +250,7 @@ def test_what_nobody_acknowledges_waits_in_order_and_a_restart_throws_it_away(
     hub.acknowledged = False
     with connect(hub) as bus:
         bus.send(message(1, b"first"))
-        bus.send_many([message(2, b"second"), message(3, b"third")])
+        bus.send_packet(pack_frames([(2, b"second"), (3, b"third")]))
     assert hub.poll() == []
     with connect(hub) as late:
         late.send(message(4, b"late"))
@@ -310,13 +310,13 @@ def test_own_frames_come_back_once_the_bus_has_carried_them(hub: UnixCanHub) -> 
         hub.poll()
         hub.acknowledged = False
         bus.send(message(1, b"a"))
-        bus.send_many([message(2, b"b"), message(3, b"c")])
+        bus.send_packet(pack_frames([(2, b"b"), (3, b"c")]))
         hub.poll()
-        assert bus.recv_many(0.0) == []
+        assert bus.carried() == b""
         hub.acknowledged = True
         hub.poll()
-        assert bus.recv_many(0.0) == [(1, b"a"), (2, b"b"), (3, b"c")]
-        assert bus.recv_many(0.0) == []
+        assert unpack_frames(bus.carried()) == [(1, b"a"), (2, b"b"), (3, b"c")]
+        assert bus.carried() == b""
 
 
 @pytest.mark.parametrize("broadcast_to", ["the leaving", "the left", "nobody"])
@@ -343,7 +343,7 @@ def test_receiving_gives_up_after_the_timeout_and_connecting_without_a_hub_at_on
         UnixCanBus(str(path))
     with UnixCanHub(path) as hub, connect(hub) as bus:
         begin = time.monotonic()
-        assert bus.recv_many(0.02) == []
+        assert bus.recv_packet(0.02) == b""
         assert time.monotonic() - begin >= 0.015
 
 
@@ -369,7 +369,7 @@ def test_a_hub_replaces_a_stale_socket_and_its_clients_learn_that_it_closed(path
     with connect(hub) as bus:
         hub.close()
         with pytest.raises(can.CanOperationError):
-            bus.recv_many(1.0)
+            bus.recv_packet(1.0)
         with pytest.raises(can.CanOperationError):
             bus.send(message(1, b""))
 

@@ -32,7 +32,7 @@ from shared.can import cansimple, cansimple_06
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_float, pack_u32
 from shared.can.cansimple_06 import Command06, DriveError06, ProcedureResult, SdoOpcode
 from shared.can.sensor_frames import ImuAssembler
-from shared.can.unix_can import REMOTE_FLAG, UnixCanBus
+from shared.can.unix_can import REMOTE_FLAG, UnixCanBus, unpack_frames
 from shared.config.robot_config import RobotConfig
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
@@ -64,7 +64,10 @@ class Bench:
         self.front.receive()
 
     def heard(self) -> list[tuple[int, bytes]]:
-        return [(can_id & ~REMOTE_FLAG, data) for can_id, data in self.client.recv_many(0.0)]
+        return [
+            (can_id & ~REMOTE_FLAG, data)
+            for can_id, data in unpack_frames(self.client.recv_packet(0.0))
+        ]
 
     def ask(self, command: int) -> bytes:
         self.send(command, remote=True)

@@ -23,7 +23,7 @@ from services.joint.__main__ import open_drive
 from services.joint.differential import joint_from_motor
 from services.joint.drivers.base import Drive, DriveReading
 from services.joint.drivers.can_link import CanLink
-from services.joint.drivers.odrive_frames import messages_of
+from services.joint.drivers.odrive_frames import packet_of
 from shared.bus.messages import LOST_DRIVE, DriveStatus, Pair
 from shared.can import cansimple, drive_settings
 from shared.can.cansimple import Command
@@ -488,7 +488,7 @@ def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
         taken = link.connect()
         for _ in range(LIMITS_TIMES):
             link.receive(_APART_S)  # nothing is sent to a drive that is not heard
-            taken = taken and link.send(messages_of(wiring.node_ids, (limits,)))
+            taken = taken and link.send(packet_of(wiring.node_ids, (limits,)))
     finally:
         link.close()
     if not taken:

@@ -28,6 +28,9 @@ STUCK_MS: Final = 15
 RESTART_MS: Final = 30
 """Age at which frames that were not carried are thrown away: with a cycle of 5 ms and the restart
 itself none becomes 50 ms old."""
+ASK_AFTER_NS: Final = 4 * NS_PER_MS
+"""Age of an own frame from which `xrl_unix` is asked whether the bus has carried it: asking is a
+system call."""
 PROOF_MS: Final = 50
 """An arming request goes only to a bus that has carried an own frame within this time."""
 PROBE_MS: Final = 100
@@ -112,6 +115,19 @@ class BusWatch:
     def waits(self) -> bool:
         """True while own frames have not come back."""
         return bool(self._waiting)
+
+    def heard_in_order(self, now_ns: int) -> bool:
+        """As `heard`; return True if the bus needs nothing else of the link in this cycle."""
+        if not self.echoes:
+            self.heard(now_ns)
+            return True
+        self._heard_ns = now_ns
+        waiting = self._waiting
+        return not self.unacknowledged and (not waiting or now_ns - waiting[0] < ASK_AFTER_NS)
+
+    def waited_ns(self, now_ns: int) -> int:
+        """Return the age of the oldest own frame that has not come back; 0: all have."""
+        return now_ns - self._waiting[0] if self._waiting else 0
 
     def restart_due(self, now_ns: int) -> bool:
         """Return True if frames wait that must not reach the drive any more."""

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import select
+import socket
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Final, TypeAlias
 
 import can
 
-from services.joint.drivers.bus_watch import BusWatch
+from services.joint.drivers.bus_watch import ASK_AFTER_NS, BusWatch
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.cansimple_06 import Command06
 from shared.can.interface import limit_queue, restart
-from shared.can.unix_can import ERROR_FLAG, EXTENDED_FLAG
+from shared.can.unix_can import (
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    FRAME_BYTES,
+    REMOTE_FLAG,
+    STANDARD_MASK,
+    Frame,
+    UnixCanBus,
+    pack_frame,
+    unpack_frames,
+)
 from shared.clock import NS_PER_MS, now_ns
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
@@ -45,29 +56,20 @@ modules' frames away before a process is woken for them, and is waited for by `s
 BUS_OFF: Final = 0x40
 """Class of an error frame (linux/can/error.h): the controller has left the bus."""
 
-Frame: TypeAlias = tuple[int, bytes]
-"""Arbitration id, with SocketCAN's flags, and payload."""
-Receive: TypeAlias = Callable[[float], Sequence[Frame]]
-"""Waits for at most the given seconds and returns all received frames."""
-Send: TypeAlias = Callable[[Sequence[can.Message]], int]
-"""Returns how many of the messages, from the first, the bus has taken."""
+Receive: TypeAlias = Callable[[float], bytes]
+"""Waits for at most the given seconds and returns all received frames, packed."""
+Send: TypeAlias = Callable[[bytes], int]
+"""Takes packed frames; returns how many bytes of them, from the first, the bus has taken."""
 
 
-def message(node_id: int, command: int, data: bytes) -> can.Message:
-    """Return a frame to a node."""
-    return can.Message(
-        arbitration_id=cansimple.arbitration_id(node_id, command), data=data, is_extended_id=False
-    )
+def packed(node_id: int, command: int, data: bytes) -> bytes:
+    """Return a frame to a node, packed as SocketCAN does."""
+    return pack_frame(cansimple.arbitration_id(node_id, command), len(data), data)
 
 
-def request_of(node_id: int, command: int) -> can.Message:
-    """Return a request for a node's answer to a command."""
-    return can.Message(
-        arbitration_id=cansimple.arbitration_id(node_id, command),
-        is_remote_frame=True,
-        dlc=8,
-        is_extended_id=False,
-    )
+def request_of(node_id: int, command: int) -> bytes:
+    """Return a request for a node's answer to a command, packed."""
+    return pack_frame(cansimple.arbitration_id(node_id, command) | REMOTE_FLAG, 8, b"")
 
 
 class CanLink:
@@ -99,13 +101,14 @@ class CanLink:
         self._drives = {
             cansimple.arbitration_id(node, command) for node in node_ids for command in HEARD
         }
-        self._probe = (message(node_ids[0], Command06.GET_VERSION, b""),)
-        self._greeting: Sequence[can.Message] = ()
+        self._probe = packed(node_ids[0], Command06.GET_VERSION, b"")
+        self._greeting = b""
         self._bus: can.BusABC | None = None
         self._receive: Receive = _nothing
         self._send: Send = _drop
+        self._carried: Callable[[], bytes] | None = None
         self._retry_at_ns = 0
-        self._commands: Sequence[can.Message] = ()
+        self._commands = b""
         self._commands_until_ns = 0
         self._commands_proven = False
 
@@ -141,28 +144,49 @@ class CanLink:
         self.watch.reopened()
         with suppress(OSError):
             limit_queue(self._bus)
-        self._receive = receiver(self._bus, in_kernel=self._config.interface in IN_KERNEL)
-        self._send = sender(self._bus)
+        in_kernel = self._config.interface in IN_KERNEL
+        self._receive = receiver(self._bus, in_kernel=in_kernel)
+        self._send = sender(self._bus, in_kernel=in_kernel)
+        self._carried = self._bus.carried if isinstance(self._bus, UnixCanBus) else None
         return True
 
-    def receive(self, timeout_s: float) -> Sequence[Frame]:
+    def receive(self, timeout_s: float) -> list[Frame]:
         """Return the frames of one wait; none, too, if the bus failed, which closes it.
 
         Error frames are among them: they are for `error_frame`.
         """
+        frames = unpack_frames(self.receive_packet(timeout_s))
+        self.take_in(frames, now_ns())
+        return frames
+
+    def receive_packet(self, timeout_s: float) -> bytes:
+        """As `receive`, but packed; `take_in` or `hear_drive` must follow."""
         if self._commands:
             self._send_commands()
         try:
-            frames = self._receive(timeout_s)
-            off = not frames and self._bus is not None and self._bus.state is can.BusState.ERROR
+            packet = self._receive(timeout_s)
+            off = not packet and self._bus is not None and self._bus.state is can.BusState.ERROR
         except (can.CanError, OSError):
             self._disconnect()
-            return ()
+            return b""
         if off:
             self._go_off()
-        else:
-            self._look_after(frames)
-        return frames
+        return packet
+
+    def take_in(self, frames: Sequence[Frame], now: int) -> None:
+        """Take in what frames show of the bus; throw away what must not wait any longer."""
+        watch = self.watch
+        for can_id, _ in frames:
+            if can_id in self._drives:
+                watch.heard(now)
+            elif can_id in self._own:
+                watch.carried(now)
+        self._look_after(now)
+
+    def hear_drive(self, now: int) -> None:
+        """As `take_in`, of frames that are all the drive's."""
+        if not self.watch.heard_in_order(now) or self._commands or self._greeting:
+            self._look_after(now)
 
     def error_frame(self, can_id: int) -> None:
         """Take in an error frame: a bus that is off is closed."""
@@ -171,43 +195,47 @@ class CanLink:
         else:
             self.error_frames += 1
 
-    def send(self, messages: Sequence[can.Message]) -> bool:
-        """Hand messages to the bus; False if it did not take them all.
+    def send(self, packet: bytes, awaited: int = 0) -> bool:
+        """Hand frames to the bus; False if it did not take them all.
 
         What waits by `order` goes first; until it has gone, nothing else goes.
+
+        Args:
+            packet: the frames.
+            awaited: how many of them are `ECHOED` ones to axis0.
         """
         if self._commands and not self._send_commands():
             return False
         # A full queue comes here too. A dead link shows in receiving.
-        return self._hand_over(messages, now_ns()) == len(messages)
+        return self._hand_over(packet, awaited, now_ns()) == len(packet)
 
-    def greet(self, messages: Sequence[can.Message]) -> None:
+    def greet(self, packet: bytes) -> None:
         """Send the first requests on a newly opened bus.
 
         They go before the drive was heard: whether they are carried shows if anybody is there, and
         whether frames wait from an earlier process. After an outage they wait for the drive.
         """
         if self.watch.unacknowledged:
-            self._greeting = messages
+            self._greeting = packet
         else:
-            self._send(messages)
+            self._send(packet)
             self._send_probe(now_ns())
 
-    def order(self, messages: Sequence[can.Message], *, proven: bool = False) -> None:
-        """Send messages of which none may be missing, in this order.
+    def order(self, packet: bytes, *, proven: bool = False) -> None:
+        """Send frames of which none may be missing, in this order.
 
         A row of a dozen can be longer than the queue of the interface (ten frames, unless
         set): the rest follows when there is room, within `COMMANDS_MS`. They take the place
         of an order that is still waiting.
 
         Args:
-            messages: the row.
+            packet: the row.
             proven: send it only once the bus has just carried a frame: an arming request that had
                 to wait would arm a drive at another time.
         """
         if self._bus is None:
             return
-        self._commands = [*messages, *self._probe] if proven and self.watch.echoes else messages
+        self._commands = packet + self._probe if proven and self.watch.echoes else packet
         self._commands_until_ns = now_ns() + COMMANDS_MS * NS_PER_MS
         self._commands_proven = proven
         self._send_commands()
@@ -219,54 +247,62 @@ class CanLink:
 
     def _send_commands(self) -> bool:
         """Send as many frames as the bus has room for; True if none is left."""
-        now = now_ns()
+        now, waiting = now_ns(), self._commands
         if now > self._commands_until_ns:
-            self._commands = ()
+            self._commands = b""
         elif not self._commands_proven or self.watch.may_arm(now):
-            self._commands = self._commands[self._hand_over(self._commands, now) :]
+            self._commands = waiting[self._hand_over(waiting, self._awaited(waiting), now) :]
         elif self.watch.may_send(now) and not self.watch.waits:
             self._send_probe(now)
         return not self._commands
 
-    def _hand_over(self, messages: Sequence[can.Message], now: int) -> int:
-        """Hand frames to the bus if they would not wait there; return how many it took."""
+    def _hand_over(self, packet: bytes, awaited: int, now: int) -> int:
+        """Hand frames to the bus if they would not wait there; return the bytes that it took."""
         watch = self.watch
         if not watch.may_send(now):
             return 0
-        taken = self._send(messages)
-        if watch.echoes:
-            for each in messages[:taken]:
-                if each.arbitration_id in self._own and not each.is_remote_frame:
-                    watch.sent(now)
+        taken = self._send(packet)
+        if not watch.echoes:
+            return taken
+        if taken < len(packet):
+            awaited = self._awaited(packet[:taken])
             # a question that found no room shows nothing: later ones do, and none comes back
-            if not all(each.is_remote_frame for each in messages[taken:]):
+            if not all(can_id & REMOTE_FLAG for can_id, _ in unpack_frames(packet[taken:])):
                 watch.refused(now)
+        for _ in range(awaited):
+            watch.sent(now)
         return taken
+
+    def _awaited(self, packet: bytes) -> int:
+        """Return how many frames of a packet are awaited back."""
+        return sum(can_id in self._own for can_id, _ in unpack_frames(packet))
 
     def _send_probe(self, now: int) -> None:
         """Send a frame that changes nothing: that it comes back shows that the bus carries."""
         if self._send(self._probe):
             self.watch.sent(now)
 
-    def _look_after(self, frames: Sequence[Frame]) -> None:
-        """Take in what frames show of the bus; throw away what must not wait any longer."""
-        watch, now = self.watch, now_ns()
-        for can_id, _ in frames:
-            if can_id in self._drives:
-                watch.heard(now)
-            elif can_id in self._own:
+    def _look_after(self, now: int) -> None:
+        """Ask what the bus has carried; restart, probe or greet it if that is due."""
+        watch = self.watch
+        if self._bus is None:
+            return
+        if self._carried is not None and (
+            self._commands or watch.unacknowledged or watch.waited_ns(now) >= ASK_AFTER_NS
+        ):
+            for _ in range(self._awaited(self._carried())):
                 watch.carried(now)
         if watch.restart_due(now):
             self._restart()
         elif watch.probe_due(now):
             self._send_probe(now)
         elif self._greeting and watch.may_send(now):
-            self._greeting, greeting = (), self._greeting
+            self._greeting, greeting = b"", self._greeting
             self._send(greeting)
 
     def _restart(self) -> None:
         """Throw away what waits in the kernel and the adapter, of whatever process."""
-        self._commands = ()
+        self._commands = b""
         done = True
         try:
             restart(self._bus, self._config.channel)
@@ -287,7 +323,8 @@ class CanLink:
         self._bus = None
         self._receive = _nothing
         self._send = _drop
-        self._commands = ()
+        self._carried = None
+        self._commands = b""
 
 
 def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
@@ -309,67 +346,85 @@ def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
 
 
 def receiver(bus: can.BusABC, *, in_kernel: bool) -> Receive:
-    """Return the bus's `recv_many`, or one made for it: one wait, then all that is there.
+    """Return how to receive from a bus: one wait, then all that is there.
 
-    Where it can be, the wait is not python-can's: that is by the wall clock, and one set back
-    in the middle of it on a silent bus (NTP) would hold up the loop by as much.
+    A bus of the kernel is read at its socket: python-can makes an object of each frame, and waits
+    by the wall clock, so that one set back on a silent bus (NTP) would hold up the loop.
     """
-    ready: Receive | None = getattr(bus, "recv_many", None)
-    if ready is not None:
-        return ready
-    waits_for = (bus,) if in_kernel else ()
+    if isinstance(bus, UnixCanBus):
+        return bus.recv_packet
+    raw = getattr(bus, "socket", None) if in_kernel else None
+    if isinstance(raw, socket.socket):
 
-    def receive(timeout_s: float) -> Sequence[Frame]:
-        if waits_for:
-            if not select.select(waits_for, (), (), timeout_s)[0]:
-                return ()
-            timeout_s = 0.0
-        frames: list[Frame] = []
+        def read(timeout_s: float) -> bytes:
+            if not select.select((raw,), (), (), timeout_s)[0]:
+                return b""
+            packet = b""
+            for _ in range(FRAMES_PER_READ):
+                try:
+                    packet += raw.recv(FRAME_BYTES, socket.MSG_DONTWAIT)
+                except BlockingIOError:
+                    break
+            return packet
+
+        return read
+
+    def receive(timeout_s: float) -> bytes:
+        packet = b""
         for _ in range(FRAMES_PER_READ):
             message = bus.recv(timeout_s)
             if message is None:
                 break
             timeout_s = 0.0
-            if message.is_error_frame:
-                frames.append((message.arbitration_id | ERROR_FLAG, bytes(message.data)))
-            elif not message.is_remote_frame:
-                flag = EXTENDED_FLAG if message.is_extended_id else 0
-                frames.append((message.arbitration_id | flag, bytes(message.data)))
-        return frames
+            if not message.is_remote_frame or message.is_error_frame:
+                flags = ERROR_FLAG * message.is_error_frame | EXTENDED_FLAG * message.is_extended_id
+                packet += pack_frame(message.arbitration_id | flags, message.dlc, message.data)
+        return packet
 
     return receive
 
 
-def sender(bus: can.BusABC) -> Send:
-    """Return how to send several messages on a bus; one that it does not take ends the row."""
-    many: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_many", None)
-    if many is not None:
+def sender(bus: can.BusABC, *, in_kernel: bool) -> Send:
+    """Return how to send several frames on a bus; one that it does not take ends the row."""
+    if isinstance(bus, UnixCanBus):
+        return bus.send_packet
+    raw = getattr(bus, "socket", None) if in_kernel else None
 
-        def send_many(messages: Sequence[can.Message]) -> int:
+    def send(packet: bytes) -> int:
+        for at in range(0, len(packet), FRAME_BYTES):
+            frame = packet[at : at + FRAME_BYTES]
             try:
-                many(messages)
+                if not isinstance(raw, socket.socket):
+                    bus.send(_message(frame), timeout=0.0)
+                elif not select.select((), (raw,), (), 0.0)[1]:
+                    return at  # more than limit_queue allows is on its way
+                else:
+                    raw.send(frame, socket.MSG_DONTWAIT)
             except (can.CanError, OSError):
-                return 0
-            return len(messages)
-
-        return send_many
-
-    def send(messages: Sequence[can.Message]) -> int:
-        for count, message in enumerate(messages):
-            try:
-                bus.send(message, timeout=0.0)
-            except (can.CanError, OSError):
-                return count
-        return len(messages)
+                return at
+        return len(packet)
 
     return send
 
 
-def _nothing(_timeout_s: float) -> Sequence[Frame]:
+def _message(frame: bytes) -> can.Message:
+    """Return a packed frame as python-can has it."""
+    ((can_id, data),) = unpack_frames(frame)
+    remote = bool(can_id & REMOTE_FLAG)
+    return can.Message(
+        arbitration_id=can_id & STANDARD_MASK,
+        is_remote_frame=remote,
+        dlc=len(data),
+        data=None if remote else data,
+        is_extended_id=False,
+    )
+
+
+def _nothing(_timeout_s: float) -> bytes:
     """Receive without a bus."""
-    return ()
+    return b""
 
 
-def _drop(_messages: Sequence[can.Message]) -> int:
+def _drop(_packet: bytes) -> int:
     """Send without a bus."""
     return 0

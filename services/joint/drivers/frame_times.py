@@ -52,6 +52,12 @@ class EncoderPair:
         came[axis] = now_ns
         self._fresh |= 1 << axis
 
+    def take_both(self, first: Pair, second: Pair, now_ns: int) -> None:
+        """Take estimates of both axes that came together; all are finite."""
+        self.estimates[:] = first, second
+        self._came_ns[:] = now_ns, now_ns
+        self._fresh = _BOTH
+
     def forget(self) -> None:
         """Start over: earlier estimates belong to no sample."""
         self._fresh = 0

@@ -9,7 +9,10 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable
+from math import isfinite
 from typing import Final
+
+import msgspec
 
 from services.joint.drivers import odrive_frames
 from services.joint.drivers.base import (
@@ -19,7 +22,7 @@ from services.joint.drivers.base import (
     MotorTarget,
     is_target,
 )
-from services.joint.drivers.can_link import CanLink, message
+from services.joint.drivers.can_link import CanLink, packed
 from services.joint.drivers.firmware import (
     HEARTBEAT_BYTES,
     VERSION_BYTES,
@@ -27,14 +30,14 @@ from services.joint.drivers.firmware import (
     Dialect,
 )
 from services.joint.drivers.frame_times import EncoderPair, FrameTimes, OrderWindows
-from services.joint.drivers.odrive_frames import Frames
+from services.joint.drivers.odrive_frames import Rows
 from services.joint.drivers.replies import NOTHING, Replies
 from services.joint.drivers.resend_policy import GainRow, ResendPolicy
 from shared.bus.messages import DriveStatus, Pair
 from shared.can import cansimple
 from shared.can.cansimple import AxisState, Command
 from shared.can.cansimple_06 import Command06
-from shared.can.unix_can import ERROR_FLAG
+from shared.can.unix_can import ERROR_FLAG, unpack_frames
 from shared.clock import NS_PER_MS, NS_PER_S, machine_s, now_ns
 from shared.config.sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
@@ -47,6 +50,10 @@ CLOSE_MS: Final = 20
 # Compared in each cycle: docs/contributing.md, The control path.
 _LOST, _ARMED = DriveStatus.LOST, DriveStatus.ARMED
 _unpack_two_floats = struct.Struct("<ff").unpack_from
+_PAIR: Final = struct.Struct("<IB3xffIB3xff")
+"""The estimates of both axes in one packet: most of what a cycle receives."""
+_unpack_pair = _PAIR.unpack
+_PAIR_BYTES: Final = 8
 
 
 class OdriveCan:
@@ -86,9 +93,12 @@ class OdriveCan:
         self._node_ids = node_ids
         self._drive = drive
         self._counts_per_turn = encoder_counts_per_turn
-        self._frames = Frames(node_ids, drive)
+        self._rows = Rows(node_ids, drive)
         # The firmware takes it as food for the watchdog, and 0.6 tells its version besides.
-        self._food = [message(n, Command06.GET_VERSION, b"") for n in node_ids]
+        self._food = b"".join(packed(n, Command06.GET_VERSION, b"") for n in node_ids)
+        self._pair_ids = tuple(
+            cansimple.arbitration_id(n, Command.GET_ENCODER_ESTIMATES) for n in node_ids
+        )
         self._answers = Replies(node_ids, drive.torque_constant, encoder_counts_per_turn)
         take: dict[int, Callable[[int, bytes], None]] = {
             Command.GET_ENCODER_ESTIMATES: self._take_estimates,
@@ -126,44 +136,43 @@ class OdriveCan:
         All frames that wait are read and the newest of each axis wins. A reading with
         status LOST repeats the last sample and its time.
         """
+        link = self._link
         now = now_ns()
         deadline = now + int(timeout_s * NS_PER_S)
-        if not self._link.is_open and not self._connect():
+        if not link.is_open and not self._connect():
             time.sleep(max(0.0, machine_s(timeout_s)))
             return self._silence(now_ns())
         while True:
-            self._pump(machine_s((deadline - now) / NS_PER_S))
-            now = now_ns()
+            now = self._pump(machine_s((deadline - now) / NS_PER_S))
             if self._encoders.complete():
-                unheard = self._times.sampled(now)
-                status = self._report.status
-                if unheard and status is not _LOST:
-                    self._forget()
-                    status = _LOST
-                if self._link.watch.carries_nothing(now):
-                    status = DriveStatus.UNACKNOWLEDGED
-                elif status is not _ARMED and now < self._windows.feed_until_ns:
-                    self._link.send(self._food)
-                if now >= self._heat_at_ns and self._report.dialect == "0.6":
-                    self._heat_at_ns = now + HEAT_EVERY_NS
-                    self._link.send(self._answers.ask_heat)
-                if now >= self._supply_at_ns:
-                    self._supply_at_ns = now + SUPPLY_EVERY_NS
-                    self._link.send(self._answers.ask_supply)
-                return self._reading(status)
-            if now >= deadline or not self._link.is_open:
-                break
-        return self._silence(now)
+                return self._sampled(now)
+            if now >= deadline or not link.is_open:
+                return self._silence(now)
+
+    def _sampled(self, now: int) -> DriveReading:
+        """Return the reading of a new sample; ask for what is due."""
+        link, answers = self._link, self._answers
+        unheard = self._times.sampled(now)
+        status = self._report.status
+        if unheard and status is not _LOST:
+            self._forget()
+            status = _LOST
+        if link.watch.carries_nothing(now):
+            status = DriveStatus.UNACKNOWLEDGED
+        elif status is not _ARMED and now < self._windows.feed_until_ns:
+            link.send(self._food, awaited=1)
+        if now >= self._heat_at_ns and self._report.dialect == "0.6":
+            self._heat_at_ns = now + HEAT_EVERY_NS
+            link.send(answers.ask_heat)
+        if now >= self._supply_at_ns:
+            self._supply_at_ns = now + SUPPLY_EVERY_NS
+            link.send(answers.ask_supply)
+        return self._reading(status)
 
     def write_torque(self, torque: Pair) -> None:
         """Send both motor torques, N m, at most `current_lim`'s worth; not a number is zero."""
-        frames = self._frames
-        frames.fill_torques(torque)
-        messages = frames.torques
         settles = self._due.with_torques(now_ns())
-        if settles:
-            messages = frames.first_torques
-        if not self._link.send(messages):
+        if not self._link.send(self._rows.torques(torque, settles=settles), awaited=1):
             self.write_failures += 1
             if settles:
                 self._due.cut_off(GainRow.ALL)
@@ -174,15 +183,11 @@ class OdriveCan:
         A target that is not finite is not sent: the drive keeps the last one. Over CAN
         velocity and torque travel in thousandths: 0.035 N m at the joint.
         """
-        frames = self._frames
         if not self._link.is_open or not is_target(target):
             self.write_failures += 1
             return
-        frames.fill_inputs(target)
         row = self._due.with_target((target.pos_gain, target.vel_gain), now_ns())
-        if row is not GainRow.INPUTS:
-            frames.fill_gains(target)
-        if not self._link.send(frames.rows[row][self._first]):
+        if not self._link.send(self._rows.target(row, target, self._first), awaited=1):
             self.write_failures += 1
             self._first ^= 1  # what is cut off again is then the other axis's
             self._due.cut_off(row)
@@ -207,7 +212,7 @@ class OdriveCan:
 
     def clear_errors(self) -> None:
         """See `Drive.clear_errors`."""
-        self._link.send(odrive_frames.messages_of(self._node_ids, odrive_frames.CLEARING))
+        self._link.send(odrive_frames.packet_of(self._node_ids, odrive_frames.CLEARING))
 
     def set_position(self, turns: Pair) -> None:
         """Write both motors' position, turns; see `Drive.set_position`.
@@ -230,7 +235,7 @@ class OdriveCan:
     def close(self) -> None:
         """Release the bus and stay away from it; an order that waits has `CLOSE_MS` to go."""
         deadline = now_ns() + CLOSE_MS * NS_PER_MS
-        while not self._link.send(()) and self._link.is_open and now_ns() < deadline:
+        while not self._link.send(b"") and self._link.is_open and now_ns() < deadline:
             time.sleep(1e-3)
         self._link.close()
 
@@ -245,28 +250,50 @@ class OdriveCan:
         self._report.requested(armed=armed)
         self._answers.forget_torques()
         self._windows.ordered(now_ns())
-        frames = odrive_frames.messages_of(self._node_ids, commands)
-        self._link.order(frames, proven=proven)
+        self._link.order(odrive_frames.packet_of(self._node_ids, commands), proven=proven)
 
-    def _pump(self, timeout_s: float) -> None:
-        """Take in the frames of one wait; most of a shared bus's are other modules'."""
-        takers = self._takers
-        frames = self._link.receive(max(0.0, timeout_s))
-        self._times.now_ns = now_ns()
+    def _pump(self, timeout_s: float) -> int:
+        """Take in the frames of one wait; most of a shared bus's are other modules'.
+
+        Returns:
+            when they were received, ns.
+        """
+        link, takers = self._link, self._takers
+        packet = link.receive_packet(max(0.0, timeout_s))
+        self._times.now_ns = now = now_ns()
+        if len(packet) == _PAIR.size and self._take_pair(packet, now):
+            link.hear_drive(now)
+            return now
+        frames = unpack_frames(packet)
+        link.take_in(frames, now)
         for can_id, data in frames:
             found = takers.get(can_id)
             if found is not None:
                 axis, take = found
                 take(axis, data)
             elif can_id & ERROR_FLAG:
-                self._link.error_frame(can_id)
+                link.error_frame(can_id)
+        return now
+
+    def _take_pair(self, packet: bytes, now: int) -> bool:
+        """Take the estimates of both axes; False if the packet is anything else."""
+        id_0, bytes_0, pos_0, vel_0, id_1, bytes_1, pos_1, vel_1 = _unpack_pair(packet)
+        if (id_0, id_1) != self._pair_ids or bytes_0 != _PAIR_BYTES or bytes_1 != _PAIR_BYTES:
+            return False
+        first, second = (pos_0, vel_0), (pos_1, vel_1)
+        if first == NOTHING or second == NOTHING or not isfinite(pos_0 + vel_0 + pos_1 + vel_1):
+            return False
+        counted = self._answers.counted
+        counted[0] = counted[1] = None
+        self._encoders.take_both(first, second, now)
+        return True
 
     def _take_estimates(self, axis: int, data: bytes) -> None:
         if len(data) == 8:
             estimate = _unpack_two_floats(data)
             answers = self._answers
             if estimate == NOTHING and self.dialect != "0.6":
-                self._link.send((answers.ask_counts[axis],))
+                self._link.send(answers.ask_count[axis])
                 estimate = answers.counted[axis] or estimate
             else:
                 answers.counted[axis] = None
@@ -286,7 +313,7 @@ class OdriveCan:
         if report.dialect == "":
             self._link.send(self._answers.ask_version)
         if report.status is not DriveStatus.ARMED and report.dialect == "0.5":
-            self._link.send((self._answers.ask_counts[axis],))
+            self._link.send(self._answers.ask_count[axis])
         found_armed = report.status is DriveStatus.ARMED and self._due.gains is None
         if found_armed and self._answers.torques is None:
             self._link.send(self._answers.ask_currents)  # whoever takes it over asks for them
@@ -316,17 +343,26 @@ class OdriveCan:
 
     def _reading(self, status: DriveStatus) -> DriveReading:
         """Return the newest estimates with a status."""
+        answers = self._answers
         (pos_0, vel_0), (pos_1, vel_1) = self._encoders.estimates
-        return DriveReading(
+        reading = DriveReading(
             self._times.sample_ns,
             (pos_0, pos_1),
             (vel_0, vel_1),
             status,
             self._report.errors,
-            self._answers.torques if self._due.gains is None else None,
-            self._answers.encoder_zero(),
-            *self._answers.heat(),
-            supply_v=self._answers.supply_v,
+            answers.torques if self._due.gains is None else None,
+            supply_v=answers.supply_v,
+        )
+        if not answers.has_news:
+            return reading
+        answers.has_news = False
+        fet, motor = answers.heat()
+        return msgspec.structs.replace(
+            reading,
+            encoder_zero=answers.encoder_zero(),
+            fet_celsius=fet,
+            motor_celsius=motor,
         )
 
     def _connect(self) -> bool:
@@ -339,6 +375,6 @@ class OdriveCan:
         self._answers.forget_counts()
         if not self._times.has_recent_sample(now_ns()):
             self._report.forget()
-        version = self._answers.ask_version if self._report.dialect == "" else []
-        self._link.greet([*version, *self._answers.ask_counts])
+        version = self._answers.ask_version if self._report.dialect == "" else b""
+        self._link.greet(version + b"".join(self._answers.ask_count))
         return True

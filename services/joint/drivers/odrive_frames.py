@@ -8,14 +8,14 @@ from __future__ import annotations
 from struct import Struct
 from typing import Final
 
-import can
-
 from services.joint.drivers.base import MotorTarget
-from services.joint.drivers.can_link import message
+from services.joint.drivers.can_link import packed
 from services.joint.drivers.firmware import Dialect
+from services.joint.drivers.resend_policy import GainRow
 from shared.bus.messages import Pair
 from shared.can import cansimple
 from shared.can.cansimple import AxisState, Command, ControlMode, InputMode
+from shared.can.unix_can import FRAME_BYTES
 from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
 
@@ -23,8 +23,12 @@ Nodes = tuple[int, int]
 CanCommand = tuple[Command, bytes]
 """A command with its payload, for both axes."""
 
-_pack_float = Struct("<f").pack
-_pack_two_floats = Struct("<ff").pack
+_INPUT: Final = "IB3xfhh"
+_pack_inputs = Struct(f"<{_INPUT}{_INPUT}").pack
+_pack_gains_and_input = Struct(f"<IB3xf4xIB3xff{_INPUT}").pack
+_pack_torques = Struct("<IB3xf4xIB3xf4x").pack
+_MILLI: Final = 1000.0
+_MILLI_MAX: Final = (1 << 15) - 1
 
 IDLING: Final[tuple[CanCommand, ...]] = (
     (Command.SET_INPUT_TORQUE, cansimple.pack_float(0.0)),
@@ -34,9 +38,9 @@ CLEARING: Final[tuple[CanCommand, ...]] = ((Command.CLEAR_ERRORS, b"\0"),)
 """0.6 takes a byte (whether to blink), 0.5 looks at none."""
 
 
-def messages_of(nodes: Nodes, commands: tuple[CanCommand, ...]) -> list[can.Message]:
+def packet_of(nodes: Nodes, commands: tuple[CanCommand, ...]) -> bytes:
     """Return the frames of commands to both axes."""
-    return [message(node, command, data) for command, data in commands for node in nodes]
+    return b"".join(packed(node, command, data) for command, data in commands for node in nodes)
 
 
 def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
@@ -61,75 +65,82 @@ def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
     )
 
 
-class Frames:
-    """The frames that are sent in every cycle or often: made once, filled each time.
+class Rows:
+    """Packs the frames that are sent in every cycle or often.
 
-    Attributes:
-        torques: both input torques.
-        first_torques: with the limits and modes that arming has sent.
-        rows: what goes out with a target, by `resend_policy.GainRow`, with axis0 first and with
-            axis1 first. After a full queue cut one axis off, the other is not cut off next.
-            An axis's gains come right before the target that they belong to. Its stiffness is
-            the product of both, and where they change by much (DAMP) pos_gain falls: it goes
-            first, or the stiffness doubles in between. A mode that is set puts a 0.5 drive's
-            input_pos to where the motor is: the axis's own target follows at once.
+    An axis's gains come right before the target that they belong to. Its stiffness is the product
+    of both, and where they change by much (DAMP) pos_gain falls: it goes first, or the stiffness
+    doubles in between. A mode that is set puts a 0.5 drive's input_pos to where the motor is: the
+    axis's own target follows at once.
     """
 
     def __init__(self, nodes: Nodes, drive: DriveConfig) -> None:
         self._torque_max = drive.current_lim * drive.torque_constant
         limits = cansimple.pack_two_floats(drive.vel_limit, drive.current_lim)
-        limit_frames = [message(n, Command.SET_LIMITS, limits) for n in nodes]
-        torque_mode, position_mode = (
-            [message(n, Command.SET_CONTROLLER_MODE, _modes(onboard=onboard)) for n in nodes]
-            for onboard in (False, True)
+        self._limits = packet_of(nodes, ((Command.SET_LIMITS, limits),))
+        mode = Command.SET_CONTROLLER_MODE
+        self._torque_mode = packet_of(nodes, ((mode, _modes(onboard=False)),))
+        self._position_modes = [packed(node, mode, _modes(onboard=True)) for node in nodes]
+        self._torque_ids, self._input_ids, self._vel_gain_ids, self._pos_gain_ids = (
+            [cansimple.arbitration_id(node, command) for node in nodes]
+            for command in (
+                Command.SET_INPUT_TORQUE, Command.SET_INPUT_POS,
+                Command.SET_VEL_GAINS, Command.SET_POS_GAIN,
+            )
+        )  # fmt: skip
+
+    def torques(self, torque: Pair, *, settles: bool) -> bytes:
+        """Pack torques, N m, within `current_lim`; one that is not finite becomes zero.
+
+        `settles`: with the limits and modes that arming has sent.
+        """
+        most, (id_0, id_1) = self._torque_max, self._torque_ids
+        first, second = (
+            value
+            if -most <= value <= most
+            else most
+            if value > most
+            else -most
+            if value < 0
+            else 0.0
+            for value in torque
         )
-        self.torques = [message(n, Command.SET_INPUT_TORQUE, bytes(4)) for n in nodes]
-        self._inputs = [message(n, Command.SET_INPUT_POS, bytes(8)) for n in nodes]
-        self._vel_gains = [message(n, Command.SET_VEL_GAINS, bytes(8)) for n in nodes]
-        self._pos_gains = [message(n, Command.SET_POS_GAIN, bytes(4)) for n in nodes]
-        self.first_torques = [*limit_frames, *torque_mode, *self.torques]
-        lone = [[target] for target in self._inputs]
-        gains = [list(both) for both in zip(self._pos_gains, self._vel_gains, strict=True)]
-        with_gains = [own + target for own, target in zip(gains, lone, strict=True)]
-        first = [
-            [*own, mode, *target]
-            for own, mode, target in zip(gains, position_mode, lone, strict=True)
-        ]
-        self.rows = (
-            _either_first([], lone),
-            _either_first([], with_gains),
-            _either_first(limit_frames, first),
-        )
+        packet = _pack_torques(id_0, 4, first, id_1, 4, second)
+        return self._limits + self._torque_mode + packet if settles else packet
 
-    def fill_torques(self, torque: Pair) -> None:
-        """Write torques, N m, within `current_lim`; one that is not finite becomes zero."""
-        limit = self._torque_max
-        for frame, value in zip(self.torques, torque, strict=True):
-            if not -limit <= value <= limit:
-                value = limit if value > limit else -limit if value < -limit else 0.0  # noqa: PLW2901
-            frame.data[:] = _pack_float(value)
+    def target(self, row: GainRow, target: MotorTarget, first: int) -> bytes:
+        """Pack a target, and what goes out with it.
 
-    def fill_inputs(self, target: MotorTarget) -> None:
-        """Write position, velocity and torque.
-
+        After a full queue cut one axis off, `first` is the other: it is not cut off next.
         Velocity and torque travel in thousandths: the torque to 0.035 N m at the joint.
         """
-        for frame, pos, vel, torque in zip(
-            self._inputs, target.pos_turns, target.vel_turns, target.torque, strict=True
-        ):
-            frame.data[:] = cansimple.pack_input_pos(pos, vel, torque)
+        second = 1 - first
+        pos, vel, torque, ids = target.pos_turns, target.vel_turns, target.torque, self._input_ids
+        if row is GainRow.INPUTS:
+            return _pack_inputs(
+                ids[first], 8, pos[first], _milli(vel[first]), _milli(torque[first]),
+                ids[second], 8, pos[second], _milli(vel[second]), _milli(torque[second]),
+            )  # fmt: skip
+        packet = self._limits if row is GainRow.ALL else b""
+        for axis in (first, second):
+            frames = _pack_gains_and_input(
+                self._pos_gain_ids[axis], 4, target.pos_gain[axis],
+                self._vel_gain_ids[axis], 8, target.vel_gain[axis], 0.0,
+                ids[axis], 8, pos[axis], _milli(vel[axis]), _milli(torque[axis]),
+            )  # fmt: skip
+            if row is GainRow.ALL:
+                at = len(frames) - FRAME_BYTES
+                frames = frames[:at] + self._position_modes[axis] + frames[at:]
+            packet += frames
+        return packet
 
-    def fill_gains(self, target: MotorTarget) -> None:
-        """Write the gains, without an integrator."""
-        for frame, gain in zip(self._vel_gains, target.vel_gain, strict=True):
-            frame.data[:] = _pack_two_floats(gain, 0.0)
-        for frame, gain in zip(self._pos_gains, target.pos_gain, strict=True):
-            frame.data[:] = _pack_float(gain)
+
+def _milli(value: float) -> int:
+    """Return thousandths as the nearest int16."""
+    return round(max(-_MILLI_MAX, min(_MILLI_MAX, value * _MILLI)))
 
 
-def positions(
-    nodes: Nodes, turns: Pair, dialect: Dialect, counts_per_turn: int | None
-) -> list[can.Message]:
+def positions(nodes: Nodes, turns: Pair, dialect: Dialect, counts_per_turn: int | None) -> bytes:
     """Return the frames that write both motors' position: turns for 0.6, counts for 0.5.
 
     Raises:
@@ -150,18 +161,10 @@ def positions(
         payloads = [cansimple.pack_i32(round(turn * scale)) for turn in turns]
     else:
         payloads = [cansimple.pack_float(turn) for turn in turns]
-    return [
-        message(node, Command.SET_LINEAR_COUNT, data)
+    return b"".join(
+        packed(node, Command.SET_LINEAR_COUNT, data)
         for node, data in zip(nodes, payloads, strict=True)
-    ]
-
-
-def _either_first(
-    before: list[can.Message], axes: list[list[can.Message]]
-) -> tuple[list[can.Message], list[can.Message]]:
-    """Return a row with axis0's frames before axis1's, and one the other way round."""
-    first, second = axes
-    return [*before, *first, *second], [*before, *second, *first]
+    )
 
 
 def _modes(*, onboard: bool) -> bytes:

@@ -28,10 +28,11 @@ class Replies:
     Attributes:
         ask_version: requests for the firmware's version.
         ask_currents: requests for the currents.
-        ask_counts: requests for the encoders' counts.
+        ask_count: request for the encoder's count, for each axis.
         ask_heat: requests for the temperatures, which firmware 0.6 knows.
         ask_supply: request for the voltage of the supply.
         supply_v: the newest, V; 0: not known.
+        has_news: an answer has come that `encoder_zero` or `heat` may return.
         counted: position in turns, without velocity, of an axis that sends no estimates; None: no
             answer, or estimates have arrived.
     """
@@ -46,14 +47,19 @@ class Replies:
             torque_constant: N m/A.
             counts_per_turn: counts of an encoder per turn; None: counts are ignored.
         """
-        self.ask_version = [request_of(n, Command06.GET_VERSION) for n in node_ids]
-        self.ask_currents = [request_of(n, Command.GET_IQ) for n in node_ids]
-        self.ask_counts = [request_of(n, Command.GET_ENCODER_COUNT) for n in node_ids]
-        self.ask_heat = [request_of(n, Command06.GET_TEMPERATURE) for n in node_ids]
+
+        def requests(command: int) -> bytes:
+            return b"".join(request_of(node, command) for node in node_ids)
+
+        self.ask_version = requests(Command06.GET_VERSION)
+        self.ask_currents = requests(Command.GET_IQ)
+        self.ask_count = [request_of(n, Command.GET_ENCODER_COUNT) for n in node_ids]
+        self.ask_heat = requests(Command06.GET_TEMPERATURE)
         self.counted: list[Pair | None] = [None, None]
         self._heat: list[Pair | None] = [None, None]
-        self.ask_supply = [request_of(node_ids[0], Command.GET_VBUS)]
+        self.ask_supply = request_of(node_ids[0], Command.GET_VBUS)
         self.supply_v = 0.0
+        self.has_news = False
         self._torques: list[float | None] = [None, None]
         self._zeros: list[float | None] = [None, None]
         self._torque_constant = torque_constant
@@ -77,6 +83,7 @@ class Replies:
         """Take the temperatures of axis 0 or 1: output stage, motor."""
         if len(data) == _BYTES:
             self._heat[axis] = cansimple.unpack_two_floats(data)
+            self.has_news = True
 
     def forget_counts(self) -> None:
         """Forget the counts: the drive may have restarted, or be another one."""
@@ -101,6 +108,7 @@ class Replies:
             self.counted[axis] = (shadow_count / self._counts_per_turn, 0.0)
             per_turn = self._counts_per_turn
             self._zeros[axis] = (shadow_count - in_turn) % per_turn / per_turn
+            self.has_news = True
 
     def take_supply(self, _axis: int, data: bytes) -> None:
         """Take the supply's voltage; both axes have one."""

@@ -20,7 +20,7 @@ from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState
-from shared.can.unix_can import Frame, UnixCanBus
+from shared.can.unix_can import UnixCanBus
 from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig, DriveConfig
 
@@ -110,15 +110,15 @@ class Shed:
         self.now_s = 0.0
         self.rigs: list[Rig] = []
         self.drivers: list[OdriveCan] = []
-        receive = UnixCanBus.recv_many
+        receive = UnixCanBus.recv_packet
 
-        def recv_many(bus: UnixCanBus, timeout: float) -> list[Frame]:
-            frames = receive(bus, 0.0)
-            if not frames:
+        def recv_packet(bus: UnixCanBus, timeout: float) -> bytes:
+            packet = receive(bus, 0.0)
+            if not packet:
                 self.wait(timeout)
-            return frames
+            return packet
 
-        monkeypatch.setattr(UnixCanBus, "recv_many", recv_many)
+        monkeypatch.setattr(UnixCanBus, "recv_packet", recv_packet)
         monkeypatch.setattr(time, "sleep", self.wait)
         for module in (odrive_can, can_link):
             monkeypatch.setattr(module, "now_ns", self.now_ns)

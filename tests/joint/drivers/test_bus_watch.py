@@ -6,7 +6,6 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-import can
 import pytest
 
 from services.joint.drivers.base import MotorTarget
@@ -23,7 +22,7 @@ from services.simulator.fronts.unix_can_hub import UnixCanHub
 from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, split_id
 from shared.can.cansimple_06 import Command06
-from shared.can.unix_can import Frame, UnixCanBus
+from shared.can.unix_can import Frame, UnixCanBus, unpack_frames
 from shared.clock import NS_PER_MS
 from tests.joint.drivers.can_bench import Bench
 from tests.joint.drivers.rig import AXES, TARGET, Line, Shed
@@ -204,21 +203,19 @@ class Cut(Line):
 
     def __init__(self, shed: Shed, monkeypatch: pytest.MonkeyPatch) -> None:
         STAMPS.clear()
-        send_many, restart = UnixCanBus.send_many, UnixCanBus.restart
+        send_packet, restart = UnixCanBus.send_packet, UnixCanBus.restart
 
-        def stamped(bus: UnixCanBus, messages: list[can.Message]) -> None:
-            send_many(bus, messages)
-            for each in messages:
-                flag = 0x4000_0000 if each.is_remote_frame else 0
-                data = bytes(each.data).ljust(each.dlc, b"\0")
-                STAMPS.append(((each.arbitration_id | flag, data), self.ms))
+        def stamped(bus: UnixCanBus, packet: bytes) -> int:
+            taken = send_packet(bus, packet)
+            STAMPS.extend((frame, self.ms) for frame in unpack_frames(packet[:taken]))
+            return taken
 
         def restarted(bus: UnixCanBus) -> None:
             restart(bus)
             self.restarts += 1
             STAMPS.clear()
 
-        monkeypatch.setattr(UnixCanBus, "send_many", stamped)
+        monkeypatch.setattr(UnixCanBus, "send_packet", stamped)
         monkeypatch.setattr(UnixCanBus, "restart", restarted)
         self.restarts = 0
         super().__init__(shed, StampingHub)

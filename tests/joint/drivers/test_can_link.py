@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-import os
+import socket
 import time
 from collections.abc import Callable, Iterator
 
 import can
 import pytest
 
-from services.joint.drivers.can_link import ECHOED, FRAMES_PER_READ, HEARD, RETRY_MS, receiver
+from services.joint.drivers.can_link import (
+    ECHOED,
+    FRAMES_PER_READ,
+    HEARD,
+    RETRY_MS,
+    packed,
+    receiver,
+    sender,
+)
 from services.joint.drivers.odrive_can import OdriveCan
 from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisState, Command, arbitration_id, pack_two_floats
 from shared.can.cansimple_06 import Command06
+from shared.can.interface import limit_queue
+from shared.can.unix_can import FRAME_BYTES
 from shared.clock import NS_PER_MS
 from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
@@ -134,7 +144,7 @@ def test_a_flooded_bus_does_not_hold_up_the_loop(bench: Bench) -> None:
         return frame(NODES[0], Command.GET_IQ, is_remote_frame=True), True
 
     bench.bus._recv_internal = flood  # type: ignore[method-assign]
-    assert list(receiver(bench.bus, in_kernel=False)(0.5)) == []
+    assert receiver(bench.bus, in_kernel=False)(0.5) == b""
     assert timeouts == [0.5] + [0.0] * (FRAMES_PER_READ - 1)
 
 
@@ -223,45 +233,53 @@ def test_the_kernel_filters_by_the_nodes_to_wake_for(
     kernel.driver.close()
 
 
-class QuietBus(FakeBus):
-    """A bus on a file descriptor, as socketcan's, with nothing on it."""
+class KernelBus(FakeBus):
+    """A bus at a socket, as socketcan's; `wire` is its other end."""
 
     def __init__(self) -> None:
-        self.ends = os.pipe()
+        self.socket, self.wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         super().__init__("can7")
 
-    def fileno(self) -> int:
-        return self.ends[0]
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        assert timeout is not None
-        assert timeout < 1.0, "the wait is by the wall clock"
-        os.read(self.ends[0], 1)
-        return super()._recv_internal(timeout)
+    def close(self) -> None:
+        for end in (self.socket, self.wire):
+            end.close()
+        with pytest.raises(OSError, match="closed twice"):
+            self.shutdown()
 
 
 @pytest.fixture
-def quiet() -> Iterator[QuietBus]:
-    bus = QuietBus()
+def kernel() -> Iterator[KernelBus]:
+    bus = KernelBus()
     yield bus
-    for end in bus.ends:
-        os.close(end)
-    with pytest.raises(OSError, match="closed twice"):
-        bus.shutdown()
+    bus.close()
 
 
-def test_a_wall_clock_set_back_does_not_hold_up_reading_a_silent_bus(
-    quiet: QuietBus, monkeypatch: pytest.MonkeyPatch
+def test_a_bus_of_the_kernel_is_read_at_its_socket_and_silence_ends_by_the_monotonic_clock(
+    kernel: KernelBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the kernel; and a frame is read at once."""
+    """A wall clock set back does not hold up the loop."""
     backwards = iter(range(10**9, 0, -3600))
     monkeypatch.setattr("can.bus.time", lambda: next(backwards))
-    receive = receiver(quiet, in_kernel=True)
+    receive = receiver(kernel, in_kernel=True)
     before = time.monotonic()
-    assert list(receive(0.01)) == []
+    assert receive(0.01) == b""
     assert time.monotonic() - before > 0.009
+    frames = [packed(node, Command.HEARTBEAT, bytes(8)) for node in NODES]
+    for each in frames:
+        kernel.wire.send(each)
+    assert receive(5.0) == b"".join(frames)
     assert next(backwards) == 10**9, "python-can was not asked"
-    monkeypatch.undo()
-    quiet.waiting.append(frame(NODES[0], Command.HEARTBEAT, bytes(8)))
-    os.write(quiet.ends[1], b"12")
-    assert len(receive(5.0)) == 1
+
+
+def test_a_bus_of_the_kernel_takes_what_there_is_room_for(kernel: KernelBus) -> None:
+    """Frames that may wait are few (`limit_queue`); the rest of the row is not sent."""
+    limit_queue(kernel)
+    send = sender(kernel, in_kernel=True)
+    frames = [packed(NODES[0], Command.SET_POS_GAIN, bytes((n, 0, 0, 0))) for n in range(100)]
+    taken = send(b"".join(frames))
+    assert 0 < taken < 100 * FRAME_BYTES
+    kernel.wire.setblocking(False)
+    arrived = b"".join(kernel.wire.recv(FRAME_BYTES) for _ in range(taken // FRAME_BYTES))
+    assert arrived == b"".join(frames)[:taken]
+    with pytest.raises(BlockingIOError):
+        kernel.wire.recv(FRAME_BYTES)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import re
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
-import can
 import pytest
 
 from services.joint.drivers.base import DriveReading
@@ -17,6 +16,7 @@ from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import DriveStatus
 from shared.can import cansimple
 from shared.can.cansimple import AxisState, Command
+from shared.can.unix_can import Frame, unpack_frames
 from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import DriveError
@@ -259,13 +259,13 @@ class Link:
 
     def __init__(self) -> None:
         self.open = True
-        self.sent: list[can.Message] = []
+        self.sent: list[Frame] = []
 
     def connect(self) -> bool:
         return self.open
 
-    def send(self, messages: Sequence[can.Message]) -> bool:
-        self.sent += messages
+    def send(self, packet: bytes) -> bool:
+        self.sent += unpack_frames(packet)
         return True
 
     def receive(self, _timeout_s: float) -> tuple[()]:
@@ -281,7 +281,7 @@ def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
     link = Link()
     monkeypatch.setattr(motion_runner, "CanLink", lambda *_: link)
     motion_runner.give_back(robot, MODULE, NOWHERE)
-    sent = [(m.arbitration_id, cansimple.unpack_two_floats(bytes(m.data))) for m in link.sent]
+    sent = [(can_id, cansimple.unpack_two_floats(data)) for can_id, data in link.sent]
     nodes = robot.module_named(MODULE).node_ids
     ids = [cansimple.arbitration_id(node, Command.SET_LIMITS) for node in nodes]
     assert sorted(can_id for can_id, _ in sent) == sorted(ids * motion_runner.LIMITS_TIMES)

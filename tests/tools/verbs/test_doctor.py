@@ -80,13 +80,15 @@ from tools import cli
 from tools.bringup import drive_access
 
 said = {"can": [], "usb": [], "reads": 0}
-send_many = unix_can.UnixCanBus.send_many
+send_packet = unix_can.UnixCanBus.send_packet
 
-def record_many(bus, messages):
-    said["can"] += [[m.arbitration_id, m.is_remote_frame] for m in messages]
-    send_many(bus, messages)
+def record_packet(bus, packet):
+    frames = unix_can.unpack_frames(packet)
+    remote = unix_can.REMOTE_FLAG
+    said["can"] += [[can_id & ~remote, bool(can_id & remote)] for can_id, _ in frames]
+    return send_packet(bus, packet)
 
-unix_can.UnixCanBus.send_many = record_many
+unix_can.UnixCanBus.send_packet = record_packet
 emulated_usb = drive_access.emulated_usb
 
 @contextlib.contextmanager
