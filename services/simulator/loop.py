@@ -78,6 +78,15 @@ class SimulatorLoop:
         self._config, self._robot = config, robot
         self._world, self._bank, self._every = robot.world, robot.bank, robot.every
         self._front, self._usb, self._ports = front, usb, ports
+        every = self._every
+        self._exchanges = {
+            every.encoders,
+            every.harness,
+            every.truth,
+            every.state,
+            every.intent,
+            every.imu if robot.imu is not None else every.encoders,
+        }
         self._slip_ns = round(config.simulation.late_slip_ms * NS_PER_MS)
         self.autostart_s: float | None = None
         self._steps = 0
@@ -89,13 +98,17 @@ class SimulatorLoop:
     def run(self, stop: StopFlag) -> None:
         """Run until stopped.
 
-        A late step is followed at once by the next. Time further behind than `late_slip_ms` is
-        skipped and counted, because the services must not receive a burst.
+        A step that exchanges nothing follows the one before it in the same wake-up. A late step is
+        followed at once by the next. Time further behind than `late_slip_ms` is skipped and
+        counted, because the services must not receive a burst.
         """
         due = now_ns()
         while not stop:
             self.step()
             due += self._every.step
+            while self._exchanges_nothing():
+                self.step()
+                due += self._every.step
             behind = now_ns() - due
             if behind > self._slip_ns:
                 self._pace.lost_ns += behind
@@ -105,7 +118,8 @@ class SimulatorLoop:
     def step(self) -> None:
         """Apply the drives' frames, advance the world by one step, send what is due."""
         robot, front, every = self._robot, self._front, self._every
-        if self._steps * every.step % every.encoders == 0:
+        begins_ns = self._steps * every.step
+        if begins_ns % every.encoders == 0:
             robot.begin_faults()
             front.receive()
             robot.step_drives()
@@ -117,17 +131,21 @@ class SimulatorLoop:
             hub.poll()
         robot.step_world()
         self._steps += 1
-        at_ns = self._steps * every.step
-        if at_ns % every.harness == 0:
+        if begins_ns % every.harness == 0:
             robot.feel()
-        if robot.imu is not None and at_ns % every.imu == 0:
+        if robot.imu is not None and begins_ns % every.imu == 0:
             robot.imu.send(self._world)
-        if at_ns % every.truth == 0:
+        if begins_ns % every.truth == 0:
             self._publish_truth()
-        if at_ns % every.state == 0:
-            self._ports.state.put(robot.read_state(now_ns(), at_ns // every.state))
-        if at_ns % every.intent == 0:
+        if begins_ns % every.state == 0:
+            self._ports.state.put(robot.read_state(now_ns(), 1 + begins_ns // every.state))
+        if begins_ns % every.intent == 0:
             self._ask()
+
+    def _exchanges_nothing(self) -> bool:
+        """Return True if the next step neither receives from the services nor sends to them."""
+        begins_ns = self._steps * self._every.step
+        return not self._usb and all(begins_ns % period_ns for period_ns in self._exchanges)
 
     def _ask(self) -> None:
         """Publish the scenario's request; if another operator publishes one, rest that much."""

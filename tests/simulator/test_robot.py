@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from services.simulator import loop as simulator_loop
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_faults import AXIS_NAMES, BOOT_S, TALKS_S
 from services.simulator.drives.axis_faults import AxisErrors as Registers
@@ -28,6 +29,7 @@ from shared.can.cansimple import (
     MotorError,
     OdriveError,
 )
+from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import FAULT_KINDS, Fault, Keyframe, Scenario
 from shared.joints import MODULES
@@ -281,6 +283,25 @@ def test_the_drives_step_with_the_world_only_where_they_have_their_own_loop(
     steps = count_steps(loop, bank, monkeypatch)
     rates = robot.simulation.encoder_rate_hz * robot.simulation.timestep
     assert steps == (100 if every else pytest.approx(100 * rates, abs=1))
+
+
+@pytest.mark.parametrize(
+    ("harness_hz", "wanted"), [(250.0, [2, 4, 6, 8, 10, 12]), (200.0, [2, 4, 5, 6, 8, 10])]
+)
+def test_the_loop_wakes_up_only_for_steps_that_receive_or_send(
+    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, harness_hz: float, wanted: list[int]
+) -> None:
+    """Encoder frames are due every 2 ms; cells at 200 Hz need a wake-up of their own."""
+    harness = msgspec.structs.replace(robot.harness, rate_hz=harness_hz)
+    loop, _, _ = make_loop(msgspec.structs.replace(robot, harness=harness))
+    woken_ms: list[int] = []
+    monkeypatch.setattr(simulator_loop, "now_ns", lambda: 0)
+    monkeypatch.setattr(
+        simulator_loop, "sleep_until", lambda due: woken_ms.append(due // NS_PER_MS)
+    )
+    stop: Any = type("Stop", (), {"__bool__": lambda _: len(woken_ms) == 6})()
+    loop.run(stop)
+    assert woken_ms == wanted
 
 
 def test_a_fault_comes_at_its_time_in_the_scenario_and_not_before_that_begins(
