@@ -57,15 +57,17 @@ def test_the_package_names_the_pythons_and_extras_of_its_locks(system: Path) -> 
 @pytest.mark.parametrize(
     ("there", "taken"),
     [
-        ({"python3": "3.11"}, "python3"),
-        ({"python3": "3.13", "python3.11": "3.11"}, "python3"),
-        ({"python3": "3.10", "python3.12": "3.12"}, "python3.12"),
-        ({"python3.13": "no module named venv", "python3.12": "3.12"}, "python3.12"),
-        ({"python3": "3.99"}, None),
+        ({"python3": "3.11 900"}, "python3"),
+        ({"python3": "3.13 900", "python3.11": "3.11 500"}, "python3"),
+        ({"python3": "3.10 900", "python3.12": "3.12 900"}, "python3.12"),
+        ({"python3.13": "no module named venv", "python3.12": "3.12 900"}, "python3.12"),
+        ({"python3.12": "3.12 900", "python3": "3.12 700"}, "python3"),
+        ({"python3.12": "3.12 900", "python3": "3.12 890"}, "python3.12"),
+        ({"python3": "3.99 900"}, None),
         ({}, None),
     ],
 )
-def test_the_newest_python_that_was_tried_and_can_make_an_environment_is_taken(
+def test_the_newest_python_that_was_tried_is_taken_and_of_its_builds_one_clearly_faster(
     system: Path, there: dict[str, str], taken: str | None
 ) -> None:
     for name, version in there.items():
