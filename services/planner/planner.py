@@ -16,13 +16,14 @@ from services.planner.controller import Controller, Observation
 from services.planner.intents import OperatorRequest
 from services.planner.law.assist import Overload, OverloadState, force_up
 from services.planner.law.closed_reference import Toward
+from services.planner.law.feet import Soles
 from services.planner.law.hocca import Hocca, LawInputs, LawOutput, LawState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
 from services.planner.watch.engagement_fsm import Engagement, LimpLegWatch, RivalWatch
 from services.planner.watch.plausible import HarnessTrust, Plausible
 from services.planner.watch.reserves import HeatWatch, HeatWatchState, SupplyState, SupplyWatch
-from services.planner.watch.trips import PlannerTrips, Soles, TripsState, values_of
+from services.planner.watch.trips import PlannerTrips, TripsState, values_of
 from services.planner.watch.unattended import Unattended
 from shared.arrays import Array, vector6
 from shared.bus.messages import (

@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from services.planner.law.feet import Soles
 from services.planner.law.hocca import LawOutput
 from services.planner.law.kinematics import Measured
-from services.planner.watch.trips import CALM_NS, PlannerTrips, Soles, TripsState, values_of
+from services.planner.watch.trips import CALM_NS, PlannerTrips, TripsState, values_of
 from shared.arrays import Array
 from shared.bus.messages import Pair, Trip
 from shared.clock import NS_PER_MS

@@ -9,8 +9,8 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
+from services.planner.law.feet import ANKLES, Soles
 from services.planner.law.kinematics import Kinematics, Measured
-from services.planner.watch.trips import ANKLES, Soles
 from services.simulator.physics.posture import SoleLoad
 from shared.bus import topics
 from shared.bus.messages import (

@@ -1,23 +1,19 @@
-"""What the soles bear, and the planner's trips. Pure.
+"""The planner's trips. Pure.
 
-**Soles**, by the joints' torques. A sole whose centre of pressure reaches its edge tips, and a
-robot that is led is soft against that: leaned on from the side it fell from 50 N on. HOLD is
-stiffer, and bears 65 N and more if it begins while both soles are flat.
-
-**Trips.** A trip makes all six modules hold. No single joint service can see these faults
+A trip makes all six modules hold. No single joint service can see these faults
 (`shared.robot.trip_table`; limits: [trips] of the robot file):
 
     legs       the two legs' estimates of the torso's position differ: a sole tips, or a zero is off
     reach      the inverse kinematics does not reach the reference pose
     tracking   a joint is far from its reference
-    unloaded   a sole bears hardly anything (`Soles`)
+    unloaded   a sole bears hardly anything (`services.planner.law.feet.Soles`)
     sinking    the COM moves faster than a person leads
     turning    the torso turns faster than a person leads
     harness    the force on the person differs from the request by too much
     sagging    the person presses the robot down harder than a lead does: power of the load beyond
                assist and lead, while it sinks
     unattended the robot drifts with nobody's hand on it (`services.planner.watch.unattended`)
-    edge       a sole's centre of pressure is near its edge (`Soles`)
+    edge       a sole's centre of pressure is near its edge (`services.planner.law.feet.Soles`)
     tipping    it is at its edge: a shove of 110 N for 0.3 s, on the way into the crawl, had tipped
                the sole before `edge` counted
     balance    the COM is ahead of or behind where it is held: references that drift take it there,
@@ -42,52 +38,10 @@ import msgspec
 
 from services.planner.law.hocca import LawOutput
 from shared.arrays import Array
-from shared.bus.messages import Pair, Trip
+from shared.bus.messages import Trip
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import GRAVITY, RobotConfig
-from shared.joints import MODULE_INDEX, SIDES
+from shared.config.robot_config import RobotConfig
 from shared.robot.trip_table import PLANNER_TRIPS, limits_of
-
-ANKLES = tuple(2 * MODULE_INDEX[f"ankle_{side}"] for side in SIDES)
-"""Indices of the ankles' phi among the joints."""
-LOAD_MIN = 50.0
-"""N; a sole that bears less counts as one that bears this."""
-
-
-class Soles:
-    """Loads of the right and the left sole."""
-
-    def __init__(self, config: RobotConfig) -> None:
-        self._half_width = 0.5 * config.geometry.w_foot
-        self._leg_weight = config.leg_weight
-        self._at_rest = 0.5 * (config.total_mass * GRAVITY + config.leg_weight)
-
-    def loads(self, leg_loads: Pair) -> Pair:
-        """Return what the soles bear, N: the legs' forces on the torso, and their own weight.
-
-        NaN for a leg whose force is not known.
-
-        Args:
-            leg_loads: of the right and the left leg, N (`Measured.leg_loads`).
-        """
-        right, left = leg_loads
-        return right + self._leg_weight, left + self._leg_weight
-
-    def edge(self, tau: Array, loads: Pair) -> float:
-        """Return how far out a sole's pressure is sideways: 0 below the ankle, 1 at its edge.
-
-        The larger one of both; a load that is not known counts as half of the weight.
-
-        Args:
-            tau: joint torques (12,), N m.
-            loads: of the soles, N.
-        """
-        out = 0.0
-        for ankle, load in zip(ANKLES, loads, strict=True):
-            borne = self._at_rest if math.isnan(load) else max(load, LOAD_MIN)
-            out = max(out, abs(float(tau[ankle])) / borne)
-        return out / self._half_width
-
 
 CALM_NS: Final = NS_PER_S
 """A body that still swings passes through its limits several times a second."""
@@ -199,7 +153,7 @@ def values_of(
         output: of the law.
         q: measured joint angles (12,), rad.
         soles: what the right and the left one bear, N.
-        edge: how far out a sole's pressure is (`services.planner.watch.trips.Soles.edge`).
+        edge: how far out a sole's pressure is (`services.planner.law.feet.Soles.edge`).
         lifted: upward force of the person on the robot, N, world; None if it is not known.
         harness_rate: vertical rate of the harness point, m/s, world.
         drift: with nobody's hand on the robot, m.
