@@ -89,10 +89,6 @@ def command(seq: int, q_phi: float = 0.1) -> JointCommand:
     return sample(JointCommand, t_ns=time.monotonic_ns(), seq=seq, session=1, q_ref=pair, k_p=k_p)
 
 
-def estop(seq: int) -> Estop:
-    return Estop(t_ns=time.monotonic_ns(), seq=seq, source="test")
-
-
 class Link:
     """The planner's two ends of one module; `reaches` sends until an answer comes."""
 

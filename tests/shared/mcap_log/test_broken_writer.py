@@ -113,7 +113,7 @@ def test_an_incomplete_definition_in_a_chunk_costs_no_message(tmp_path: Path) ->
 def test_wherever_ctrl_c_comes_a_file_is_called_whole_only_if_it_has_all_it_counts(
     tmp_path: Path,
 ) -> None:
-    """Interrupt the fourth message, an attachment and finishing at every third line of the package."""
+    """Interrupt a message, an attachment and finishing at every third line of the package."""
     verdicts = set()
     for interrupted_line in itertools.count(step=3):
         path = tmp_path / "x.mcap"
