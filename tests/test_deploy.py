@@ -77,26 +77,6 @@ def test_the_newest_python_that_was_tried_is_taken_and_of_its_builds_one_clearly
     assert (done.returncode == 0) == (taken is not None)
 
 
-@pytest.mark.parametrize(
-    ("manager", "command"),
-    [
-        ("apt-get", "apt-get install libgomp1"),
-        ("dnf", "dnf install libgomp"),
-        ("", "Fedora: libgomp"),
-    ],
-)
-def test_a_library_that_the_system_lacks_is_named_with_the_command_that_brings_it(
-    system: Path, manager: str, command: str
-) -> None:
-    program(system, "python3", "exit 1")
-    if manager:
-        program(system, manager, "exit 0")
-    done = run(system, f"check_libraries {system}/python3")
-    assert done.returncode == 2
-    assert "libgomp.so.1 is missing" in done.stderr
-    assert command in done.stderr
-
-
 def test_without_a_python_uv_makes_the_environment(system: Path) -> None:
     program(system, "uv", 'printf "%s " uv "$@"')
     done = run(

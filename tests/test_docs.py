@@ -43,7 +43,7 @@ _ABROAD = {
     *("corrupt", "gemodel", "paretonormal"),  # netem
     *("camera", "settings", "ts"),  # Foxglove
     *("x_limit_torque", "x_limit_torque__mutmut_3"),  # mutmut
-    *("_us", "_hz", "_degc"),  # endings of names
+    *("_ms", "_us", "_hz", "_degc"),  # endings of names
 }
 """Names in backticks that are other programs'."""
 _EQUATION = re.compile(r"docs/law\.md\s+((?:(?:,|\s+and)?\s*\(\d+\))+)")

@@ -77,8 +77,3 @@ def test_a_gentler_hand_leads_the_same_squat_with_less_force() -> None:
     force, height = 2, 8
     assert float(gentle[force]) <= 12.0 < float(shipped[force])
     assert float(gentle[height]) == pytest.approx(float(shipped[height]), abs=0.005)
-
-
-def test_without_a_log_the_reader_names_its_usage() -> None:
-    done = run(EXAMPLES / "read_a_run.py", code=2)
-    assert "usage: read_a_run.py [-h] RUN.mcap" in done.stderr

@@ -104,20 +104,3 @@ def test_an_installed_wheel_runs_a_robot_of_its_own_directory(
     assert "config: ./robot.toml" in done.stderr
     assert "STOOD for 1.0 s" in done.stdout
     assert (lab / "run" / "run.mcap").is_file()
-
-
-@pytest.mark.system
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("bench", "--against", "HEAD"), "--against needs a checkout of XRL"),
-        (("gains",), "`xrl new DIR` makes one to be changed"),
-    ],
-)
-def test_what_an_installed_wheel_cannot_do_is_one_line(
-    words: tuple[str, ...], told: str, installed: Path, tmp_path: Path
-) -> None:
-    done = xrl(installed, tmp_path, *words)
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1, done.stderr
-    assert told in done.stderr

@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -12,16 +11,12 @@ from services.harness.loop import ZeroFile, zero_path
 from services.simulator.fronts.sensor_fronts import BIAS_MAX, HarnessFront
 from shared.bus.codec import Decoder
 from shared.bus.messages import Tare, Wrench
-from shared.can.can_sensor import sensor_of
 from shared.can.sensor_frames import SampleAssembler
-from shared.clock import NS_PER_MS
-from shared.config.sections import CanConfig
 from tests.harness.helpers import (
     HARNESS,
     PERIOD_NS,
     T0,
     TARE_CYCLES,
-    ZERO,
     Asked,
     G,
     cycles,
@@ -127,21 +122,6 @@ def test_a_zero_that_is_damaged_or_of_an_earlier_boot_is_none(tmp_path: Path) ->
     assert zero.read() is None
 
 
-def test_a_tare_that_shakes_is_reported_and_stays_invalid_until_it_is_still() -> None:
-    loop, sensor, _ = make_loop()
-    t_ns, tares = T0, []
-    for n in range(3 * TARE_CYCLES):
-        sensor.forces = legs((0.0, 0.0, 30.0 * math.sin(0.3 * n), 0.0, 0.0, 0.0))
-        message, t_ns = cycles(loop, t_ns, 1)
-        assert not message.valid
-        tares.append(message.tare)
-    assert tares[0] == Tare.RUNNING
-    assert set(tares[TARE_CYCLES + 1 :]) == {Tare.UNSTEADY}
-    sensor.forces = ZERO
-    message, _ = cycles(loop, t_ns, 2 * TARE_CYCLES + 2)
-    assert (message.valid, message.tare) == (True, Tare.DONE)
-
-
 def test_simulated_legs_carry_the_wrench_and_a_constant_bias_and_white_noise() -> None:
     hub = FrameList()
     front = HarnessFront(ROBOT, hub, seed=1)
@@ -156,16 +136,6 @@ def test_simulated_legs_carry_the_wrench_and_a_constant_bias_and_white_noise() -
     assert np.abs(front.bias).max() > 1.0, "without a bias the tare would have nothing to do"
 
 
-def test_the_simulated_sensor_sends_three_frames_in_one_packet_the_same_for_the_same_seed() -> None:
-    packets = []
-    for seed in (1, 1, 2):
-        hub = FrameList()
-        HarnessFront(ROBOT, hub, seed).send([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])
-        packets.append(hub.packets)
-    assert packets[0] == packets[1] != packets[2]
-    assert [[can_id for can_id, _ in packet] for packet in packets[0]] == [[0x300, 0x301, 0x302]]
-
-
 def test_the_simulated_cells_clip_and_the_service_calls_that_saturated() -> None:
     hub = FrameList()
     front = HarnessFront(ROBOT, hub, seed=1)
@@ -178,16 +148,3 @@ def test_the_simulated_cells_clip_and_the_service_calls_that_saturated() -> None
     message, _ = cycles(loop, t_ns, 1)
     assert message.saturated
     assert not message.valid
-
-
-def test_a_low_rate_is_no_pause_of_the_process(short_dir: Path) -> None:
-    slow = msgspec.structs.replace(
-        ROBOT,
-        harness=msgspec.structs.replace(HARNESS, rate_hz=20.0),
-        can={**ROBOT.can, HARNESS.bus: CanConfig(interface="virtual", channel="{run}")},
-    )
-    sensor = sensor_of(slow, slow.harness, SampleAssembler(), short_dir)
-    sensor.newest(T0)
-    sensor.newest(T0 + 50 * NS_PER_MS)
-    assert sensor.discarded == 0
-    sensor.close()

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import resource
 import socket
 import struct
-import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -16,10 +14,7 @@ from hypothesis import strategies as st
 
 from services.network_proxy.connection import Splitter, carries_messages
 from services.network_proxy.sockets import (
-    READ,
-    WRITE,
     SocketListener,
-    SocketWatch,
     address_of,
 )  # fmt: skip
 from shared.exceptions import BusError
@@ -37,21 +32,6 @@ from tests.network_proxy.rig import MESSAGE, WAIT_S, Rig, batch, heard, listenin
 )
 def test_an_endpoint_is_an_address(endpoint: str, address: object) -> None:
     assert address_of(endpoint) == address
-
-
-def test_an_endpoint_is_an_address_and_a_host_name_is_looked_up_before_any_link() -> None:
-    found = address_of("tcp/localhost:7447")
-    socket.inet_pton(found.family, found.where[0])
-
-
-@pytest.mark.parametrize(
-    "endpoint",
-    ["tcp/no-such-host.invalid:7447", "tcp/127.0.0.1", "udp/127.0.0.1:7447"],
-)
-def test_an_endpoint_that_cannot_be_stood_before_is_refused_by_name(endpoint: str) -> None:
-    with pytest.raises(BusError) as caught:
-        address_of(endpoint)
-    assert endpoint in str(caught.value)
 
 
 HOSTS = [(socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")]
@@ -91,14 +71,6 @@ def test_over_tcp_everything_passes_both_ways_to_the_end(tcp: Rig) -> None:
     assert knee.recv(10) == b""
 
 
-def test_over_tcp_who_dials_one_that_is_not_there_sees_the_end(tcp: Rig) -> None:
-    tcp.beyond.close()
-    dialling = tcp.dial()
-    receive(tcp, dialling, 1)
-    dialling.settimeout(WAIT_S)
-    assert dialling.recv(10) == b""
-
-
 def test_a_place_is_refused_by_name_or_cleared_of_what_a_killed_proxy_left_and_left_clear(
     tmp_path: Path,
 ) -> None:
@@ -111,93 +83,6 @@ def test_a_place_is_refused_by_name_or_cleared_of_what_a_killed_proxy_left_and_l
         dialling.connect(str(path))
     listener.close()
     assert not path.exists()
-
-
-@contextmanager
-def descriptors_left(count: int) -> Iterator[None]:
-    """Only so many more can be opened; those below the highest that is open are used up."""
-    before = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with socket.socket() as lowest_free:
-        limit = lowest_free.fileno() + count
-    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, before)
-
-
-def test_without_descriptors_who_dials_is_turned_away_and_the_loop_rests(rig: Rig) -> None:
-    dialling = [socket.socket(socket.AF_UNIX) for _ in range(3)]
-    rig.ends += dialling
-    with descriptors_left(0):
-        for end in dialling:
-            end.connect(str(rig.through))
-        rig.turn()
-        assert rig.watch.wait(0.0) == []
-    assert rig.relay.refused == 3
-    assert rig.relay.links == 0
-    assert [end.recv(1) for end in dialling] == [b""] * 3
-    planner, knee = rig.link()
-    rig.say(planner, 1)
-    assert heard(knee) == batch(MESSAGE, 1)
-
-
-def test_with_a_descriptor_for_one_end_only_neither_is_kept(rig: Rig) -> None:
-    dialling = socket.socket(socket.AF_UNIX)
-    rig.ends.append(dialling)
-    with descriptors_left(1):
-        dialling.connect(str(rig.through))
-        rig.turn()
-    assert rig.relay.refused == 1
-    assert dialling.recv(1) == b""
-
-
-@pytest.fixture
-def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
-    near, far = socket.socketpair()
-    with near, far:
-        yield near, far
-
-
-def test_each_socket_calls_its_own_function_for_its_own_events(
-    pair: tuple[socket.socket, socket.socket],
-) -> None:
-    near, far = pair
-    watch, heard = SocketWatch(), list[tuple[int, int]]()
-
-    def ready(events: int, now_ns: int) -> None:
-        heard.append((events, now_ns))
-
-    def turn() -> list[tuple[int, int]]:
-        heard.clear()
-        for call, events in watch.wait(0.0):
-            call(events, 7)
-        return list(heard)
-
-    watch.want(near, READ, ready)
-    assert turn() == []
-    far.send(b"x")
-    assert turn() == [(READ, 7)]
-    watch.want(near, READ | WRITE, ready)
-    assert turn() == [(READ | WRITE, 7)]
-    watch.want(near, WRITE, ready)
-    assert turn() == [(WRITE, 7)]
-    watch.want(near, 0, ready)
-    watch.want(near, 0, ready)
-    assert turn() == []
-    watch.close()
-
-
-def test_it_waits_by_parts_of_a_millisecond(pair: tuple[socket.socket, socket.socket]) -> None:
-    """What is asked to be late by 0.2 ms is not late by a whole one."""
-    watch, took_s = SocketWatch(), []
-    watch.want(pair[0], READ, lambda _events, _now_ns: None)
-    for _ in range(200):
-        begun = time.perf_counter()
-        assert watch.wait(0.0002) == []
-        took_s.append(time.perf_counter() - begun)
-    assert 0.0002 <= min(took_s) < 0.0009
-    watch.close()
 
 
 INIT = "81 09 f1 31 a2 df 8b 99 09"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
 
@@ -42,8 +41,6 @@ KNEES = [3, 9]
 """Indices of the knees' theta among the joints."""
 SQUAT = (1.25, 1.188, 1.1, 1.0, 0.948, 0.85)
 """Torso heights over which the robot squats, m."""
-Closed = Callable[..., Array]
-"""closed(height, x=, y=, roll=, pitch=, yaw=) -> q (12,) where the legs agree."""
 
 
 # ---- robots

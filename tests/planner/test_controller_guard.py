@@ -7,21 +7,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
-from services.planner.controller import Action, Observation, absolute, controller_maker, split_spec
+from services.planner.controller import Action, Observation, controller_maker
 from services.planner.intents import OperatorRequest
 from services.planner.law.hocca import Hocca, LawInputs, LawState
-from services.planner.law.split import LocalGains
 from services.planner.watch.controller_guard import SUPPORT, ControllerGuard, GuardState
 from shared.bus.messages import SplitSource
 from shared.exceptions import ConfigError
 from shared.robot.frames import capture_point
 from shared.robot.robot_model import stand_pose
 from shared.state import copied
-from tests.planner.states import ROBOT, Kept, with_law
+from tests.planner.states import ROBOT, Kept
 
 GOOD = """
 class Controller:
@@ -76,19 +74,6 @@ def test_a_file_that_cannot_be_used_is_one_clear_line(
     assert said in str(caught.value)
     assert "mine.py" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("spec", ["absent.py", "absent", "absent.txt", ""])
-def test_a_file_that_is_not_there_is_one_clear_line(spec: str) -> None:
-    with pytest.raises(ConfigError, match=r"FILE\.py or FILE\.py:NAME"):
-        controller_maker(spec, ROBOT)
-
-
-def test_a_spec_is_file_and_name() -> None:
-    assert split_spec("a/b.py") == (Path("a/b.py"), "Controller")
-    assert split_spec("a/b.py:LQR") == (Path("a/b.py"), "LQR")
-    assert split_spec("/home/me/.pyenv/c/mine.py:B") == (Path("/home/me/.pyenv/c/mine.py"), "B")
-    assert absolute("b.py:LQR") == f"{Path.cwd() / 'b.py'}:LQR"
 
 
 GEOMETRY = ROBOT.geometry
@@ -209,13 +194,13 @@ def test_what_is_no_action_holds_all(hocca: Hocca, seen: Observation, name: str)
 def test_gains_that_fall_are_never_sent(hocca: Hocca, seen: Observation, scale: float) -> None:
     """Each objection makes all hold twice as long; then it is asked again, at another pose."""
     soft, waits = Scripted(scaled(scale)), (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0)
-    guard = guarding(soft, hocca)
+    guard, seen = guarding(soft, hocca), seen._replace(dt=0.05)
     for steps, wait in enumerate(waits if scale == 0.3 else waits[:2], 1):
         found = guard.act(seen, leads=True)
         assert found.local.source is SplitSource.UNCERTIFIED
         assert np.array_equal(found.local.D, seen.law.local.D)
         assert "do not stand alone" in guard.state.why
-        assert seen.dt * (1 + ticks_held(guard, seen)) == pytest.approx(wait, abs=0.02)
+        assert seen.dt * (1 + ticks_held(guard, seen)) == pytest.approx(wait, abs=0.1)
         assert (guard.state.why, soft.steps) == ("", steps)
 
 
@@ -226,13 +211,6 @@ def test_stiffer_gains_that_stand_are_sent(hocca: Hocca, seen: Observation, scal
     assert found.local.source is SplitSource.CONTROLLER
     assert np.array_equal(found.local.D, scale * seen.law.local.D)
     assert found.local.margins.service >= seen.law.local.margins.service
-
-
-def test_no_own_gains_without_a_schedule(seen: Observation) -> None:
-    hocca = Hocca(msgspec.structs.replace(with_law(ROBOT, split="diagonal"), gain_schedule=None))
-    hocca.tick(LawState(), LawInputs(seen.q, seen.v, 0.004))
-    local: LocalGains = hocca.split.certify(seen.law.local.D)
-    assert local.source is SplitSource.UNCERTIFIED
 
 
 @pytest.mark.parametrize("axis", [0, 1])

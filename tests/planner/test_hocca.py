@@ -118,21 +118,6 @@ def test_the_reference_glides_to_the_centre(law: Law) -> None:
     np.testing.assert_allclose(p_ref[[2, 4]], p[[2, 4]], atol=1e-8)  # where the person leads
 
 
-def test_closed_heights_and_pitches_stay_as_found() -> None:
-    """They glided to a COM on the floor once: zero is no stand."""
-    K_p = (2810.0, 2810.0, 3000.0, 800.0, 300.0, 400.0)
-    closing = Law(with_law(ROBOT, S=(0,) * 6, K_p=K_p, split="diagonal"))
-    q = closed(1.0, x=0.02, pitch=0.3)
-    p = oracle.pose(ROBOT, q)
-    closing.align(q)
-    for _ in range(2 * round(ROBOT.law.recentre_s / DT)):
-        output = closing.tick(q)
-    np.testing.assert_allclose(output.p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
-    np.testing.assert_allclose(output.p_ref[[0, 1, 3, 5]], 0.0, atol=1e-9)
-    closing.align(q)  # and again, after it has led
-    np.testing.assert_allclose(closing.tick(q).p_ref[[2, 4]], p[[2, 4]], atol=1e-9)
-
-
 def test_reference_rates_follow_the_person(law: Law, q: Array) -> None:
     """C v_ref = 0 and J v_ref = S J v, p_C resting."""
     law.align(q)
@@ -283,30 +268,6 @@ def test_feedforward_is_exact_at_rest_and_the_feet_carry_weight_and_assist(
     np.testing.assert_allclose(got, to_carry(posed, assist), atol=1e-5)
 
 
-def test_pushed_by_the_operator_the_feet_carry_the_push_too(ik: InverseKinematics) -> None:
-    """Leant on until 2 mm off centre: sum of the feet = weight + assist + operator.
-
-    The operator pushes on the torso with what K_fail and K_c answer along p.
-    """
-    assist, moved = 150.0, np.array([0.002, -0.002, 0.0, 0.002, 0.0, 0.002])
-    centre = closed(1.1)
-    law = Law()
-    settled(law, centre, assist)
-    pushed = at_pose(ROBOT, ik, oracle.pose(ROBOT, centre) + moved, centre)
-    for _ in range(2):  # the second tick's feedforward is that of the moved reference
-        output = law.tick(pushed, STILL, assist, 0.0)
-    T = oracle.feasible(ROBOT, pushed)
-    K_fail = law.hocca.split.certificate.failsafe_stiffness(output.local.D)
-    K_c, _ = law.hocca._terms._uncoupled.at(K_fail, (T.T * output.local.D_B) @ T)
-    along_p = (K_fail + K_c) @ moved
-    torso_per_p = oracle.leg_jacobian(ROBOT, RIGHT, pushed) @ T[oracle.LEG[RIGHT]]
-    operator = np.linalg.solve(torso_per_p.T, along_p)
-    push = about_origin(operator, oracle.leg(ROBOT, RIGHT, pushed).torso)
-    assert np.abs(operator[:2]).min() > 3.0
-    got = on_the_feet(pushed, torque(output, pushed)) - to_carry(pushed, assist)
-    np.testing.assert_allclose(got, -push, atol=0.02 * np.abs(push).max())
-
-
 @pytest.mark.parametrize("assist", [0.0, 200.0])
 def test_each_centre_of_pressure_stays_inside_its_sole(law: Law, assist: float) -> None:
     """Over the whole squat and the whole crawl; and no foot slides."""
@@ -413,7 +374,7 @@ def test_it_finds_what_the_solver_does(away: float) -> None:
     assert (iterations == 1) == (away < 1e-4)
 
 
-@pytest.mark.parametrize("rate", [0.005, 0.05, 0.2, 0.6])
+@pytest.mark.parametrize("rate", [0.02, 0.6])
 def test_led_beyond_it_stays_inside(rate: float) -> None:
     """The solver takes a start for granted; one beyond the limits let q_ref creep to 0.17 rad."""
     limits = np.array(ROBOT.joint_limits())
@@ -442,18 +403,6 @@ def test_the_next_begins_inside(rate: float) -> None:
     reference.v[:] = rate
     low, high = np.array(ROBOT.joint_limits()).T
     np.testing.assert_array_equal(reference.expected(1.0), low if rate < 0.0 else high)
-
-
-def test_its_kinematics_are_those_of_its_own_arrays() -> None:
-    """With the load sharing that the tick chose, not one of its own."""
-    reference, q = Reference(ROBOT), closed(1.0, pitch=0.3)
-    D_left = np.diag([0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
-    reference.load(np.zeros(6), np.zeros(6), np.zeros(3), np.zeros(3), D_left)
-    reference.evaluate(q)
-    kinematics = reference.kinematics()
-    np.testing.assert_array_equal(kinematics.J, reference.J)
-    np.testing.assert_array_equal(kinematics.p, reference.p)
-    np.testing.assert_array_equal(kinematics.J_harness, reference.J_harness)
 
 
 def test_of_nan_nothing_is_found_but_the_next_is() -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.planner.intents import Intents, OperatorRequest
@@ -104,6 +104,7 @@ def test_shift_and_rate_stay_within_their_limits(course: list[tuple[Vector4, flo
 
 
 @pytest.mark.parametrize("largest", [LARGEST, STRAIGHT], ids=["limits", "none: it stands straight"])
+@settings(max_examples=20)
 @given(wanted=asked)
 def test_it_comes_to_what_is_asked_or_as_near_as_it_may(largest: Vector4, wanted: Vector4) -> None:
     follower = Kept(ShiftReference(largest), ShiftState())

@@ -16,7 +16,6 @@ from shared.robot.robot_model import stand_pose
 from tests.planner import oracle
 from tests.planner.oracle import LEFT, RIGHT
 from tests.planner.states import ROBOT, SQUAT, WEIGHT, Stand, closed
-from tools.lab.design.push_limit import LoadedStand
 from tools.reach import ReachSolver
 
 POSES = (
@@ -61,13 +60,6 @@ def test_closure_is_the_legs_disagreement_when_they_are_open(
     kinematics.update(q_open)
     assert np.abs(kinematics.closure).max() > opening / 2
     np.testing.assert_allclose(kinematics.closure, oracle.closure(ROBOT, q_open), atol=1e-9)
-
-
-def test_an_open_pose_is_in_between(averaging: Kinematics, q: Array) -> None:
-    q_open = q + 1e-3 * np.random.default_rng(5).normal(size=12)
-    averaging.update(q_open)
-    middle = 0.5 * (oracle.pose(ROBOT, q_open, RIGHT) + oracle.pose(ROBOT, q_open, LEFT))
-    np.testing.assert_allclose(averaging.p, middle, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -218,52 +210,6 @@ def test_hessian_is_symmetric_and_each_leg_has_its_own(kinematics: Kinematics, q
         np.testing.assert_array_equal(hessian[6:, :6], 0.0)
 
 
-def test_hessian_is_linear_in_the_load(kinematics: Kinematics, q: Array) -> None:
-    kinematics.update(q)
-    one, other = LOADS["all"], LOADS["yaw"]
-    parts = [2.0 * kinematics.hessian_times(*one).copy(), kinematics.hessian_times(*other).copy()]
-    whole = kinematics.hessian_times(2.0 * one.F + other.F, 2.0 * one.F_harness)
-    np.testing.assert_allclose(whole, sum(parts), atol=1e-9)
-
-
-def torque_slope(kinematics: Kinematics, q: Array, F: Array) -> Array:
-    """Return d(J^T F)/dq (12, 12) by differences, the shares held."""
-    kinematics.update(q)
-    D_left = kinematics.D_left.copy()
-
-    def torque(q_near: Array) -> Array:
-        kinematics.update(q_near, D_left)
-        return np.asarray(kinematics.J.T @ F, float)
-
-    return oracle.derivative(torque, q)
-
-
-@pytest.mark.parametrize("force", [(0, 0, 731.6), (50, 0, 0), (0, 50, 0), (30, -20, 731)])
-def test_hessian_of_a_force_is_the_slopes_symmetric_part(
-    kinematics: Kinematics, q: Array, force: tuple[float, float, float]
-) -> None:
-    """Off the closed chain too, where the legs are pulled apart."""
-    F = np.array([*force, 0.0, 0.0, 0.0])
-    want = torque_slope(kinematics, q, F)
-    kinematics.update(q)
-    hessian = kinematics.hessian_times(F, NO_FORCE)
-    np.testing.assert_allclose(hessian, 0.5 * (want + want.T), atol=1e-5)
-
-
-def test_holding_the_shares_changes_internal_torques_only(kinematics: Kinematics, q: Array) -> None:
-    """The slope with the shares let free differs a lot, but not along what the robot can do."""
-
-    def torque(q_near: Array) -> Array:
-        kinematics.update(q_near)
-        return np.asarray(kinematics.J.T @ WEIGHT, float)
-
-    free = oracle.derivative(torque, q)
-    error = free - torque_slope(kinematics, q, WEIGHT)
-    T = oracle.feasible(ROBOT, q)
-    assert np.abs(error).max() > 10.0
-    np.testing.assert_allclose(T.T @ error @ T, 0.0, atol=1e-3)
-
-
 # ---- a payload off the torso's centre
 
 PLACE = (0.08, -0.05, 0.15)
@@ -301,17 +247,6 @@ def test_a_payload_beside_is_balanced_and_certified(laden: RobotConfig, laden_q:
     np.testing.assert_allclose(
         stand.certificate.failsafe_stiffness(D), felt, atol=1e-4 * np.abs(felt).max()
     )
-
-
-def test_the_push_limits_knees_weigh_the_same_wherever_the_payload_is(
-    laden: RobotConfig, laden_q: Array
-) -> None:
-    knees = []
-    for config in (ROBOT, laden):
-        kinematics = Kinematics(config)
-        kinematics.update(laden_q)
-        knees.append(LoadedStand(config, kinematics, np.zeros((12, 6)), np.zeros((12, 12))))
-    np.testing.assert_allclose(knees[0]._tau_knees, knees[1]._tau_knees, atol=1e-6)
 
 
 def test_a_centred_payload_leaves_the_schedule(laden: RobotConfig) -> None:

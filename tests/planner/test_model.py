@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import msgspec
 import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from services.planner.law.model import leg_geometry, load_pinocchio, q_tree
+from services.planner.law.model import load_pinocchio, q_tree
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, SIDES
@@ -105,39 +104,3 @@ def test_it_is_the_papers_equations_seen_from_each_foot() -> None:
         from_torso = data.subtree_com[0] - data.body("torso").xpos
         com = ROBOT.mass.module * weighed / m_total
         np.testing.assert_allclose(from_torso, com, atol=1e-12)
-
-
-def test_leg_geometry_is_the_papers_from_the_foot_up() -> None:
-    right, left = leg_geometry(ROBOT)
-    for index, geometry in enumerate((right, left)):
-        want = oracle.leg(ROBOT, index, np.zeros(12))
-        np.testing.assert_allclose(geometry.r_foot, want.ankle, atol=1e-12)
-        np.testing.assert_allclose(geometry.r_knee, want.knee, atol=1e-12)
-        np.testing.assert_allclose(geometry.r_torso, want.torso, atol=1e-12)
-        np.testing.assert_allclose(geometry.axes, [[1, 0, 0], [0, 1, 0]] * 3, atol=1e-12)
-
-
-@pytest.mark.parametrize("joint", range(len(JOINTS)), ids=JOINTS)
-def test_positive_theta_leans_forward_and_positive_phi_to_the_right(joint: int) -> None:
-    """A point 1 m above the torso's centre, seen from the foot."""
-    simulated, side, q = Simulated(ROBOT), SIDES[joint // 6], np.zeros(12)
-    heads = []
-    for angle in (0.0, 0.1):
-        q[joint] = angle
-        simulated.update(q)
-        heads.append(simulated.seen_from_foot(side, np.array([0.0, 0.0, 1.0])))
-    forward, left, _ = heads[1] - heads[0]
-    assert forward > 0.09 if "theta" in JOINTS[joint] else left < -0.09
-
-
-def test_a_changed_payload_changes_both() -> None:
-    lighter = msgspec.structs.replace(ROBOT, mass=msgspec.structs.replace(ROBOT.mass, payload=5.0))
-    full, empty = Simulated(ROBOT), Simulated(lighter)
-    rigid = Rigid(lighter)
-    q = random_q(1)[0]
-    for one in (full, empty, rigid):
-        one.update(q)
-    assert empty.model.body_mass.sum() == pytest.approx(74.58 - 15.4)
-    assert pin.computeTotalMass(rigid.model) == pytest.approx(74.58 - 15.4)
-    np.testing.assert_allclose(rigid.data.com[0], empty.data.subtree_com[0], atol=1e-12)
-    assert np.abs(empty.data.subtree_com[0] - full.data.subtree_com[0]).max() > 0.01

@@ -344,45 +344,6 @@ def test_states_that_come_every_period_wait_for_no_longer_than_a_poll() -> None:
     assert looking.polls < 5 * 500, "between two ticks it rests"
 
 
-@pytest.mark.parametrize("held_up_ns", [NS_PER_MS, 2 * NS_PER_MS, 3 * NS_PER_MS, 8 * NS_PER_MS])
-def test_after_a_late_tick_they_are_soon_in_time(held_up_ns: int) -> None:
-    looking = Looking()
-    for tick in range(100):
-        late_ns = looking.tick_at(NS_PER_S + tick * PERIOD_NS, held_up_ns if tick == 50 else 0)
-        assert late_ns <= POLL_NS + FOLLOW_NS or 50 <= tick <= 50 + 2 * held_up_ns // PERIOD_NS + 1
-
-
-@pytest.mark.parametrize("busy_ns", [NS_PER_MS, 3 * NS_PER_MS // 2])
-def test_kept_from_looking_it_does_not_stay_late(busy_ns: int) -> None:
-    """They run for a while before the states are complete; it then found those of a period ago."""
-    loop = Looking().loop
-    complete = [NS_PER_S + tick * PERIOD_NS for tick in range(100)]
-    now_ns, taken, ages = complete[1] - 100_000, 0, []
-    ticked_ns = 0
-    while taken < 90:
-        newest = (now_ns - NS_PER_S) // PERIOD_NS
-        ticked = newest > taken and now_ns - ticked_ns >= PERIOD_NS // 2
-        if ticked or (not ages and newest >= 0):
-            ticked, taken, ticked_ns = True, max(taken, newest), now_ns
-            ages.append(now_ns - complete[newest])
-        now_ns = loop._next_look(now_ns, ticked=ticked)
-        until_ns = PERIOD_NS - (now_ns - NS_PER_S) % PERIOD_NS
-        if 100_000 < until_ns < busy_ns:  # kept until just before the next are complete
-            now_ns += until_ns - 100_000
-    assert ages[0] > 3 * NS_PER_MS, "it began a period late"
-    assert max(ages[5:]) <= 2 * POLL_NS
-
-
-def test_after_a_long_gap_it_rests_again() -> None:
-    looking = Looking()
-    looking.tick_at(NS_PER_S)
-    looking.tick_at(3 * NS_PER_S)
-    before = looking.polls
-    for tick in range(1, 50):
-        looking.tick_at(3 * NS_PER_S + tick * PERIOD_NS)
-    assert looking.polls - before < 5 * 50
-
-
 def test_while_arrivals_are_compared_it_does_not_rest() -> None:
     looking = Looking(compares=True)
     looking.tick_at(NS_PER_S)

@@ -62,21 +62,6 @@ def test_between_nodes_each_gain_is_linear_in_height_and_in_pitch(
     np.testing.assert_allclose(scheduled.at(z, pitch), np.tile(inside, 2), rtol=1e-12)
 
 
-def test_at_a_node_the_gains_are_the_tables_for_both_legs(schedule: GainSchedule) -> None:
-    scheduled = ScheduledGains(schedule)
-    for (i, z), (j, pitch) in product(enumerate(schedule.z), enumerate(schedule.pitch)):
-        np.testing.assert_allclose(scheduled.at(z, pitch), np.tile(schedule.D[i][j], 2))
-
-
-def test_gains_do_not_step_from_node_to_node(schedule: GainSchedule) -> None:
-    """Over the squat and the crawl, 0.2 mm at a time: no jump of a gain."""
-    scheduled = ScheduledGains(schedule)
-    for pitch_end in (0.0, 1.2):
-        path = zip(np.linspace(0.95, 0.63, 1600), np.linspace(0.0, pitch_end, 1600), strict=True)
-        table = np.array([scheduled.at(z, pitch) for z, pitch in path])
-        assert np.abs(np.diff(table, axis=0)).max() < 10.0
-
-
 def test_in_the_squat_and_the_crawl_the_schedule_is_enough(
     schedule: GainSchedule, stand: Stand
 ) -> None:

@@ -128,11 +128,6 @@ def test_one_late_state_moves_nothing(phases: Kept) -> None:
     assert phases.state.phases == [0] * N_MODULES
 
 
-def test_modules_that_do_not_hear_are_not_told_again_and_again(phases: Kept) -> None:
-    run(phases, Modules([0, CYCLE_NS, 0, 0, 0, 0]), 3 * EVERY_TICKS, heard=False)
-    assert phases.state.phases == [0, 1, 0, 0, 0, 0]
-
-
 def test_a_new_planner_adopts_the_phases_that_the_last_one_left(phases: Kept) -> None:
     modules = Modules([0, CYCLE_NS, 0, 0, 0, 0])
     run(phases, modules, 250)

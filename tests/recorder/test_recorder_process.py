@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import resource
 import signal
 import subprocess
@@ -16,12 +15,11 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from services.recorder import __main__ as recorder
 from shared.bus import topics
 from shared.bus.messages import JointState
 from shared.bus.session import Publisher, open_session
 from shared.config.files import load
-from shared.exceptions import ConfigError, RunError
+from shared.exceptions import RunError
 from shared.places import DEFAULT_CONFIG
 from shared.run_directory import live_dir
 from tests.shared.mcap_log import runs
@@ -186,22 +184,6 @@ def test_a_snapshot_is_written_when_asked_for_and_holds_what_was_before() -> Non
         assert found == list(range(found[0], rig.sent))
         assert len(found) > target // 2
         assert log.metadata["split"]["snapshot"] == "requested by SIGUSR1"
-
-
-@pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, 1e9])
-def test_a_snapshot_of_no_length_or_of_days_is_refused(seconds: float) -> None:
-    with pytest.raises(ConfigError, match="--snapshot: SECONDS"):
-        recorder._snapshot(seconds, CONFIG.recorder, {})
-
-
-def test_what_makes_no_sense_is_one_line_before_anything_starts(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "services.recorder", "--run-dir", str(tmp_path / "r")]
-    command += ["--out", str(tmp_path / "out"), "--attach=a=absent"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "absent: (file): cannot be read" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_write_error_ends_with_exit_code_2_and_one_line(rig: Rig) -> None:

@@ -50,14 +50,6 @@ def test_a_module_in_fault_or_damp_gives_the_seconds_before_and_after(mode: Mode
     assert snapshot.reason == f"{EVENT_KEY}: {mode.name}"
 
 
-@pytest.mark.parametrize("mode", [Mode.DISARMED, Mode.HOLD, Mode.TRACK])
-def test_other_modes_are_no_fault(mode: Mode) -> None:
-    snapshot = ring()
-    feed(snapshot, at(1), event(2, mode), at(3))
-    assert not snapshot.writing
-    assert taken(snapshot) == []
-
-
 def test_an_emergency_stop_is_a_fault() -> None:
     snapshot = ring()
     feed(snapshot, at(1, ESTOP_KEY, codec.encode(runs.sample(Estop))))
@@ -79,14 +71,6 @@ def test_a_sender_that_never_sent_or_has_no_steady_rate_is_not_missed() -> None:
     snapshot = ring()
     feed(snapshot, at(0), at(0, topics.SIM_CONTROL.key(ROBOT)), at(9))
     assert not snapshot.writing
-
-
-def test_asked_for_it_is_written_without_a_fault() -> None:
-    snapshot = ring()
-    feed(snapshot, at(1))
-    assert snapshot.trigger("asked", NS_PER_S)
-    assert not snapshot.trigger("asked again", NS_PER_S), "it is being written already"
-    assert taken(snapshot) == [1.0]
 
 
 def test_a_second_fault_meanwhile_makes_it_longer() -> None:
@@ -116,10 +100,3 @@ def test_memory_is_bounded_and_the_oldest_go_first() -> None:
     snapshot.trigger("asked", NS_PER_S)
     assert taken(snapshot)[0] == pytest.approx(0.9)
     assert snapshot.memory == 0
-
-
-def test_an_unreadable_event_is_kept_and_is_no_fault() -> None:
-    snapshot = ring()
-    feed(snapshot, at(1, EVENT_KEY, b"\xff{"))
-    assert not snapshot.writing
-    assert len(snapshot) == 1

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from shared import run_directory
@@ -90,10 +89,6 @@ def command(seq: int, q_phi: float = 0.1) -> JointCommand:
     return sample(JointCommand, t_ns=time.monotonic_ns(), seq=seq, session=1, q_ref=pair, k_p=k_p)
 
 
-def estop(seq: int) -> Estop:
-    return Estop(t_ns=time.monotonic_ns(), seq=seq, source="test")
-
-
 class Link:
     """The planner's two ends of one module; `reaches` sends until an answer comes."""
 
@@ -144,44 +139,6 @@ def test_only_the_newest_message_is_kept(run_dir: Path) -> None:
         assert newest is not None
         assert newest.seq == 10
         assert commands.take() is None
-
-
-def test_stream_gives_every_sample_undecoded_with_its_key(run_dir: Path) -> None:
-    with (
-        open_session(ROBOT, "recorder", run_dir) as recorder,
-        open_session(ROBOT, TOOL, run_dir) as tool,
-    ):
-        before = time.monotonic_ns()
-        every = recorder.stream([f"xrl/{ROBOT.name}/joint/*/*", f"xrl/{ROBOT.name}/estop"])
-        stops = tool.publisher(topics.ESTOP, Estop)
-        commands = tool.publisher(topics.JOINT_COMMAND, JointCommand, "hip_left")
-        samples: list[tuple[str, bytes, int]] = []
-
-        def keys_heard() -> set[str]:
-            samples.extend(iter(every.take, None))
-            return {key for key, _, _ in samples}
-
-        def both_heard() -> bool:
-            return stops.put(estop(-1)) and commands.put(command(-1)) and len(keys_heard()) == 2
-
-        assert comes_true(both_heard)
-        for seq in range(50):
-            stops.put(estop(seq))
-            commands.put(command(seq))
-            time.sleep(0.001)
-
-        def numbers(key: str) -> list[int]:
-            return [msgspec.json.decode(text)["seq"] for name, text, _ in samples if name == key]
-
-        def complete() -> bool:
-            return all(numbers(key)[-1] == 49 for key in keys_heard())
-
-        assert comes_true(complete)
-        robot = f"xrl/{ROBOT.name}"
-        assert keys_heard() == {f"{robot}/joint/hip_left/command", f"{robot}/estop"}
-        for key in keys_heard():
-            assert numbers(key)[-50:] == list(range(50))
-        assert all(before < t_ns <= time.monotonic_ns() for _, _, t_ns in samples)
 
 
 def longest_put_s(deaf: Link, other: Link) -> float:
@@ -305,29 +262,6 @@ def test_message_that_is_none_is_refused_and_counted_by_the_receiver(
     assert comes_true(lambda: publisher.put(command(2)) and commands.take())
 
 
-@pytest.mark.parametrize(("arguments", "code"), [((), 0), (("raise",), 7)])
-def test_a_process_without_a_subscriber_exits_by_itself(
-    start: Start, arguments: tuple[str, ...], code: int
-) -> None:
-    process = start(
-        """
-with open_session(robot, "planner", run_dir) as session:
-    latest = session.latest(topics.JOINT_COMMAND, JointCommand, "ankle_right")
-    stream = session.stream([f"xrl/{robot.name}/**"])
-    publisher = session.publisher(topics.ESTOP, Estop)
-    for seq in range(100):
-        assert publisher.put(Estop(t_ns=0, seq=seq, source="x"))
-    assert latest.take() is None
-    print("left", flush=True)
-    if sys.argv[2:]:
-        raise SystemExit(7)
-""",
-        *arguments,
-    )
-    out, err = process.communicate(timeout=30)
-    assert (out, err, process.returncode) == ("left\n", "", code)
-
-
 def test_a_second_process_of_a_name_learns_that_the_endpoint_is_in_use(
     run_dir: Path, start: Start
 ) -> None:
@@ -412,17 +346,6 @@ def test_fleet_opened_dialling_side_first_is_linked_pair_by_pair(run_dir: Path) 
             assert comes_true(lambda s=session, e=shown: s.alive() == e), name  # type: ignore[misc]
             assert len(session._session.info.peers_zid()) == len(expected) - 1
             assert len(session._session.info.links()) == len(expected) - 1
-
-
-def test_process_has_one_zenoh_thread_set(start: Start) -> None:
-    """Five thread pools make 8 threads and more; one makes 2, or 4 while it works."""
-    process = start("""
-with open_session(robot, "planner", run_dir) as session:
-    session.publisher(topics.ESTOP, Estop).put(Estop(t_ns=0, seq=0, source="x"))
-    print(len(os.listdir("/proc/self/task")))
-""")
-    out, _ = process.communicate(timeout=30)
-    assert 2 <= int(out) <= 4
 
 
 def test_tools_that_link_are_named_with_their_place_and_are_gone_when_they_end_or_are_killed(

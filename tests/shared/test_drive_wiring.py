@@ -28,11 +28,10 @@ from shared.can.drive_settings import (
     Compare,
     WantedSetting,
     of_module,
-    same,
 )
 from shared.config.can_load import BLEND_HZ, BLEND_MAX, LOAD_MAX, BusLoad, bus_load, frame_bits
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import ConfigError, DriveError
+from shared.exceptions import ConfigError
 from shared.joints import MODULES
 from tests.shared.test_config import Table, load_changed
 
@@ -146,13 +145,6 @@ def test_a_value_fits_to_within_single_precision(
     assert WantedSetting("x", 1.2, "", compare).fits(found) is fits
 
 
-def test_true_is_one_to_a_drive_and_infinity_is_itself() -> None:
-    assert same(True, 1)
-    assert same(math.inf, math.inf)
-    assert same(math.nan, math.nan)
-    assert not same(math.inf, 1e30)
-
-
 def test_a_planted_setting_is_kept_by_that_drive_alone() -> None:
     settings = Settings()
     preset(settings, "knee_left.axis0.config.can.encoder_rate_ms=7")
@@ -163,26 +155,6 @@ def test_a_planted_setting_is_kept_by_that_drive_alone() -> None:
     assert settings.get(index, "axis0.config.can.encoder_rate_ms") == 7
     assert settings.get(index, "axis1.config.enable_watchdog") is True
     assert settings.get(0, "axis0.config.can.encoder_rate_ms") == 10
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ("knee_lft.axis0.config.can.node_id=1", "knee_left"),
-        ("nothing", "ankle_right, "),
-        ("knee_left.axis0.vel_limit=2", "axis0.controller.config.vel_limit"),
-        ("knee_left.axis0.controller.config.vel_limit=fast", "a number"),
-        ("knee_left.axis0.controller.config.vel_limit", "a number"),
-        ("knee_left.axis0.config.enable_watchdog=2", "true or false"),
-        ("knee_left.axis0.config.can.encoder_rate_ms=1.5", "int"),
-        ("knee_left.axis0.controller.config.vel_limit=nan", "float"),
-    ],
-)
-def test_a_plant_that_makes_no_sense_is_refused_with_what_would_be_right(
-    words: str, says: str
-) -> None:
-    with pytest.raises(DriveError, match=says):
-        preset(Settings(), words)
 
 
 def bits_on_the_wire(can_id: int, data: bytes) -> int:
@@ -232,13 +204,6 @@ def test_the_usual_frame_length_and_the_loads_are_those_of_the_design() -> None:
     load = bus_load(2, onboard=True, heartbeat_period_ms=20, loadcell_rate_hz=5000.0)
     assert load.rate_max_hz() == 0.0
     assert load.axes_max(500.0) == 0
-
-
-@pytest.mark.parametrize("count", range(9))
-def test_the_usual_length_lies_between_the_shortest_and_the_longest_frame(count: int) -> None:
-    shortest = 47 + 8 * count
-    longest = shortest + (34 + 8 * count - 1) // 4
-    assert shortest < frame_bits(count) < longest
 
 
 def design(axes: int) -> BusLoad:

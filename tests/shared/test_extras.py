@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from shared import extras
 from shared.exceptions import MissingPackageError
 from shared.extras import (
     EXTRAS,
@@ -18,7 +17,6 @@ from shared.extras import (
     UNLOCKED,
     is_installed,
     late,
-    libusb_fix,
     require,
 )  # fmt: skip
 
@@ -115,19 +113,6 @@ def test_what_is_absent_is_told_with_its_extra_and_what_brings_it(
         require("sim", "look at a record")
 
 
-def test_outside_of_a_checkout_pip_brings_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(extras, "CHECKOUT", tmp_path)
-    monkeypatch.setitem(sys.modules, "aiohttp", None)
-    pip = f"{re.escape(sys.executable)} -m pip install 'xrl\\[view\\]'"
-    with pytest.raises(MissingPackageError, match=pip):
-        require("view")
-    monkeypatch.setitem(sys.modules, "pip", None)
-    with pytest.raises(MissingPackageError, match=r"install 'xrl\[view\]' in place of 'xrl'"):
-        require("view")
-
-
 def test_a_late_module_is_imported_when_it_is_used_and_says_if_it_is_absent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -139,15 +124,6 @@ def test_a_late_module_is_imported_when_it_is_used_and_says_if_it_is_absent(
     cvxpy = late("cvxpy")
     with pytest.raises(MissingPackageError, match=r"^cvxpy is not installed; the extra `design`"):
         _ = cvxpy.Variable
-
-
-def test_a_folder_of_deploy_is_no_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EXTRAS, "made_up", ("plants",))
-    monkeypatch.syspath_prepend(ROOT / "deploy")
-    with pytest.raises(MissingPackageError, match=r"^plants is not installed"):
-        require("made_up")
-    with pytest.raises(MissingPackageError, match=r"^plants is not installed"):
-        _ = late("plants.inner").name
 
 
 @pytest.mark.parametrize(
@@ -175,20 +151,3 @@ def test_a_package_that_cannot_be_imported_says_why_in_one_line_and_its_extra(
         require("ros2")
     with pytest.raises(MissingPackageError, match=pattern):
         _ = late("rosbags.typesys").name
-
-
-@pytest.mark.parametrize(
-    ("manager", "said"),
-    [
-        ("apt-get", "`sudo apt-get install libusb-1.0-0`"),
-        ("dnf", "`sudo dnf install libusb1`"),
-        ("", "your package manager (Debian: libusb-1.0-0, Fedora: libusb1)"),
-    ],
-)
-def test_the_command_is_that_of_the_systems_manager(
-    manager: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    if manager:
-        (tmp_path / manager).touch(mode=0o755)
-    assert libusb_fix() == said

@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import ast
 import codecs
-import getpass
 import json
-import os
-import resource
 import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.simulator.physics import plant
 from shared import revision
 from shared.atomic_file import atomic_file, replace_file
-from shared.config import files, gain_schedule, scenarios
-from shared.exceptions import ConfigError, XrlError
-from shared.places import in_home, user_name
+from shared.exceptions import XrlError
+from shared.places import in_home
 from shared.toml_file import decoded
-from tests.conftest import ROBOT_FILE
-from tools.fleet import process_table
 
 ROOT = Path(__file__).parents[2]
-FULL_AT = 1000
 
 
 def test_a_file_takes_its_place_when_it_is_whole_whatever_a_kill_left(tmp_path: Path) -> None:
@@ -74,22 +64,6 @@ def test_an_exclusive_file_replaces_none_and_a_private_one_is_its_users_alone(
     (tmp_path / "x").unlink()
     replace_file(tmp_path / "x", b"", private=True)
     assert (tmp_path / "x").stat().st_mode & 0o777 == 0o600
-
-
-def small_disk() -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (FULL_AT, FULL_AT))
-
-
-def test_a_full_disk_is_one_line_with_the_files_name(tmp_path: Path) -> None:
-    code = "from pathlib import Path; from shared.atomic_file import replace_file; "
-    code += f"replace_file(Path({str(tmp_path / 'x')!r}), bytes({2 * FULL_AT}))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, preexec_fn=small_disk, capture_output=True,
-        text=True, check=False, timeout=60.0,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert str(tmp_path / "x") in done.stderr.splitlines()[-1]
-    assert list(tmp_path.iterdir()) == []
 
 
 WRITERS = {
@@ -148,24 +122,6 @@ def test_another_encoding_is_named_and_what_is_no_text_is_told_with_its_line(
         decoded(content)
 
 
-def test_robot_and_gains_of_an_editor_that_marks_them_are_read(tmp_path: Path) -> None:
-    for source in (ROBOT_FILE, ROBOT_FILE.with_name("robot.gains.json")):
-        content = codecs.BOM_UTF8 + source.read_bytes().replace(b"\n", b"\r\n")
-        (tmp_path / source.name).write_bytes(content)
-    assert files.load(tmp_path / "robot.toml") == files.load(ROBOT_FILE)
-
-
-READERS = (files.load, scenarios.load, process_table.load_table, plant.load, gain_schedule.read)
-
-
-@pytest.mark.parametrize("read", READERS)
-def test_a_file_in_utf_16_is_told(read: Callable[[Path], object], tmp_path: Path) -> None:
-    path = tmp_path / "a.toml"
-    path.write_bytes("a = 1\n".encode("utf-16"))
-    with pytest.raises(ConfigError, match="UTF-16; save it as UTF-8"):
-        read(path)
-
-
 def git(root: Path, *arguments: str) -> None:
     who = ("-c", "user.name=t", "-c", "user.email=t@example.invalid", "-c", "commit.gpgsign=false")
     subprocess.run(("git", "-C", str(root), *who, *arguments), check=True, capture_output=True)
@@ -204,27 +160,6 @@ def test_inside_another_checkout_without_a_commit_or_without_git_it_is_unknown(
     assert revision.in_words(unknown) == "commit unknown"
     monkeypatch.setenv("PATH", "")
     assert revision.code(checkout) == unknown
-
-
-@pytest.mark.parametrize("error", [KeyError("uid not found: 12345"), OSError(), ImportError()])
-def test_a_user_without_a_name_has_a_number(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    def unknown() -> str:
-        raise error
-
-    monkeypatch.setattr(getpass, "getuser", unknown)
-    assert user_name() == f"uid {os.getuid()}"
-
-
-@pytest.mark.parametrize(
-    ("name", "shown"), [("anna", "anna"), ("l\udce9a", "l?a"), ("a\n\x1b", "a"), ("\n", None)]
-)
-def test_a_name_can_be_printed_and_sent(
-    monkeypatch: pytest.MonkeyPatch, name: str, shown: str | None
-) -> None:
-    monkeypatch.setenv("LOGNAME", name)
-    assert user_name() == (shown or f"uid {os.getuid()}")
 
 
 def test_a_home_is_filled_in_or_the_path_refused(monkeypatch: pytest.MonkeyPatch) -> None:

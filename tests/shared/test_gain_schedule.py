@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-import tomli_w
 
 from shared.config import files as config_file
 from shared.config import gain_schedule
@@ -74,17 +71,6 @@ def test_a_schedule_comes_back_from_a_file_of_one_node_a_line_that_replaces_an_o
     assert json.loads(path.read_bytes())["version"] == gain_schedule.VERSION
 
 
-def test_a_schedule_lies_beside_the_robot_file_or_the_missing_folder_is_named(
-    schedule: GainSchedule, tmp_path: Path
-) -> None:
-    for robot_file, beside in (("lab.toml", "lab.gains.json"), ("a/b.2.toml", "a/b.2.gains.json")):
-        assert gain_schedule.path_beside(Path(robot_file)) == Path(beside)
-    path = tmp_path / "none" / "lab.gains.json"
-    with pytest.raises(ConfigError, match="cannot be written: No such file") as caught:
-        gain_schedule.write(path, schedule)
-    assert str(caught.value).startswith(f"{path}: ")
-
-
 SHIPPED = gain_schedule.path_beside(ROBOT_FILE).read_bytes()
 
 
@@ -102,16 +88,9 @@ NODES = [[[1.0] * 6] * 2] * 2
 CORRUPT = {
     "empty": (b"", "(file)", "is no gain schedule"),
     "cut off": (SHIPPED[:2000], "(file)", "truncated"),
-    "no text": (b"\xff\xfe\x00", "(file)", "is no gain schedule"),
-    "no table": (b"[1, 2]", "(file)", "Expected `object`"),
-    "empty table": (b"{}", "(file)", "missing required field `version`"),
-    "unknown key": (spoiled(wheels=4), "(file)", "wheels"),
     "five joints": (spoiled(D=[[[1.0] * 5] * 6] * 25), "(file)", "length 6"),
-    "a word": (spoiled(D=[[["stiff"] * 6] * 6] * 25), "(file)", "Expected `float`"),
     "not a number": (spoiled(z=[float("nan"), 1.0]), "(file)", "is no gain schedule"),
     "falling heights": (spoiled(z=[0.9, 0.8], pitch=[0.0, 1.0], D=NODES), "z", "do not rise"),
-    "equal heights": (spoiled(z=[0.9, 0.9], pitch=[0.0, 1.0], D=NODES), "z", "do not rise"),
-    "falling pitches": (spoiled(z=[0.8, 0.9], pitch=[1.0, 0.0], D=NODES), "pitch", "do not rise"),
     "one height": (spoiled(z=[0.9], pitch=[0.0, 1.0], D=NODES[:1]), "z", "do not rise"),
     "a row too few": (spoiled(z=[0.8, 0.9], pitch=[0.0, 1.0], D=NODES[:1]), "D", "does not fit"),
     "a row too short": (
@@ -205,22 +184,3 @@ def test_only_the_certified_split_requires_a_schedule_and_that_with_bounds(
     with pytest.raises(ConfigError, match="no bounds") as refused:
         gain_schedule.require(gain_schedule.believing(robot), Path("lab.toml"))
     assert "xrl gains --config lab.toml" in str(refused.value)
-
-
-def test_a_planner_with_a_stale_schedule_refuses_to_start_with_the_command_to_run(
-    tmp_path: Path,
-) -> None:
-    robot_file = tmp_path / "lab.toml"
-    table = msgspec.to_builtins(config_file.load(ROBOT_FILE))
-    del table["gain_schedule"]
-    table["mass"]["payload"] = 12.5
-    robot_file.write_text(tomli_w.dumps(table), encoding="utf-8")
-    shutil.copy(gain_schedule.path_beside(ROBOT_FILE), tmp_path / "lab.gains.json")
-    command = [sys.executable, "-m", "services.planner", "--config", str(robot_file)]
-    command += ["--run-dir", str(tmp_path / "r")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 2, done.stderr
-    assert "mass.payload = 20.4, not 12.5" in done.stderr
-    assert f"run `xrl gains --config {robot_file}`" in done.stderr
-    assert done.stderr.count("\n") == 1, done.stderr
-    assert not (tmp_path / "r").exists()

@@ -9,7 +9,7 @@ from typing import get_args
 
 import msgspec
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.bus import topics
@@ -23,7 +23,6 @@ from shared.exceptions import ConfigError
 from shared.joints import MODULES
 from shared.links import COMMANDS, DIRECTIONS, GROUPS, PAIRS, WRENCHES, directions_of
 from shared.network.impairment_schedule import ImpairmentSchedule
-from shared.network.proxy_protocol import RequestedImpairment
 
 TOOL = topics.OPERATOR
 
@@ -120,18 +119,6 @@ def test_as_many_are_lost_as_asked_with_bursts_or_without(loss: float, burst: fl
     assert came / 60_000 == pytest.approx(1.0 - loss, abs=0.03)
 
 
-def test_rows_of_losses_are_as_long_as_asked() -> None:
-    impairer = Impairer(Impairment(loss=0.2, burst=8.0), "a")
-    rows, row = [], 0
-    for number in range(100_000):
-        if impairer.passes(number, SIZE):
-            rows += [row] if row else []
-            row = 0
-        else:
-            row += 1
-    assert statistics.mean(rows) == pytest.approx(8.0, rel=0.1)
-
-
 def test_as_many_come_twice_or_overtake_as_asked() -> None:
     assert len(delays_ms(Impairment(duplicate=0.3), 10_000)) == pytest.approx(13_000, abs=200)
     found = delays_ms(Impairment(delay_ms=30.0, reorder=0.25), 10_000)
@@ -175,21 +162,6 @@ def test_the_same_seed_decides_the_same_and_every_message_is_counted(
         assert out == b.passes(now_ns, SIZE)
         assert all(t >= now_ns for t in out)
     assert a.passed + a.lost == 50
-
-
-def test_what_began_last_is_in_force_and_what_it_hid_comes_back() -> None:
-    direction = Direction("planner->knee_left", 0)
-    assert direction.passes(7, SIZE) == (7,)
-    direction.begin(1, Impairment(delay_ms=1.0))
-    direction.begin(2, Impairment(delay_ms=2.0))
-    assert direction.passes(0, SIZE) == (2 * NS_PER_MS,)
-    ended = direction.end(2)
-    assert ended is not None
-    assert (ended.passed, ended.lost) == (1, 0)
-    assert direction.passes(0, SIZE) == (NS_PER_MS,)
-    assert direction.end(1) is not None
-    assert direction.end(1) is None
-    assert direction.passes(7, SIZE) == (7,)
 
 
 CHANGES = st.lists(
@@ -238,33 +210,6 @@ def test_impairments_that_do_not_go_together_are_refused(
     changes: dict[str, float], right: str
 ) -> None:
     assert right in msgspec.structs.replace(Impairment(), **changes).fault()
-
-
-@given(st.floats(0.51, 0.999))
-@example(0.9)
-def test_the_burst_that_is_advised_is_accepted(loss: float) -> None:
-    right = Impairment(loss=loss, burst=1.001).fault().partition("; ")[2]
-    least = float(right.split()[4])
-    assert not Impairment(loss=loss, burst=least).fault()
-    assert least < 1.0 + loss / (1.0 - loss)
-
-
-@pytest.mark.parametrize(
-    ("idle", "cure"),
-    [
-        (Impairment(reorder=0.1), "delay_ms"),
-        (Impairment(loss=0.1, distribution="pareto"), "jitter_ms"),
-        (Impairment(ordered=True), "rate"),
-        (Impairment(ordered=True, loss=0.1), "delay_ms"),
-    ],
-)
-def test_an_ineffective_impairment_is_reported_with_what_it_lacks(
-    idle: Impairment, cure: str
-) -> None:
-    found, _, right = idle.fault().partition("; ")
-    assert found
-    assert cure.removesuffix("_ms") in right
-    assert not msgspec.structs.replace(idle, **{cure: 10.0}).fault()
 
 
 def test_links_have_their_directions_but_a_sensor_receives_nothing_and_others_are_refused() -> None:
@@ -350,19 +295,3 @@ def test_a_hidden_impairment_is_reported_with_its_directions(rig: Rig) -> None:
     assert rig.impairments.hidden(waits) == ()
     rig.impairments.end(cut, 0)
     assert rig.impairments.hidden(everywhere) == ("planner->knee_left",)
-
-
-@pytest.mark.parametrize(
-    ("link", "in_s", "hidden", "words"),
-    [
-        (WRENCHES, 0.0, (), f"{WRENCHES} delay=5ms"),
-        (WRENCHES, 0.0, (WRENCHES,), f"{WRENCHES} delay=5ms (hidden)"),
-        ("planner->joints", 0.0, COMMANDS[:2], "planner->joints delay=5ms (hidden on 2 of 6)"),
-        (WRENCHES, 2.04, (), f"{WRENCHES} delay=5ms (in 2.0 s)"),
-    ],
-)
-def test_an_inactive_impairment_names_the_reason(
-    link: str, in_s: float, hidden: tuple[str, ...], words: str
-) -> None:
-    requested = RequestedImpairment(1, link, LATE.describe(), None, 0, 0, in_s, hidden)
-    assert requested.describe() == words

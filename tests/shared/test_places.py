@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -12,10 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from services.joint.neighbours import Neighbours
 from services.joint.rearm_guard import LastState, RearmGuard, path_of
 from shared import places, run_directory
-from shared.exceptions import ConfigError, FleetError, RunError
+from shared.exceptions import ConfigError, FleetError
 from shared.places import DEFAULT_CONFIG
 from shared.process import service_parser
 from shared.run_directory import (
@@ -23,11 +21,9 @@ from shared.run_directory import (
     check_own,
     live_dir,
     make_live_dir,
-    mapped,
     open_private,
     service_directory,
 )
-from tests.tools.exit_codes import exit_code
 from tools.bringup import drive_access
 from tools.fleet.run_dir import RunDir
 from tools.verb_table import VERBS
@@ -101,21 +97,6 @@ def test_every_verb_that_takes_a_robot_file_looks_for_one() -> None:
     assert len(found) > 2 * len(DECIDE_LATER)
 
 
-def test_a_robot_file_of_another_kind_or_name_is_an_error_that_names_it(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    here.write_text("")
-    assert exit_code(["gains", "--stiffness", "--config", ""]) == 2
-    assert SAID not in capsys.readouterr().err
-    here.write_text('[vacuum]\nname = "cleaner"\n')
-    assert exit_code(["gains", "--stiffness"]) == 2
-    told = capsys.readouterr().err
-    assert told.startswith(f"{SAID}xrl: {here}: ")
-    assert told.count("\n") == 2
-    assert exit_code(["--config", "lab.toml", "sim"]) == 2
-    assert "--config comes after the verb" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("given", [None, "fleet.toml"])
 def test_a_fleet_that_is_up_keeps_its_robot_file(
     given: str | None, here: Path, monkeypatch: pytest.MonkeyPatch,
@@ -139,38 +120,11 @@ def test_a_stop_from_afar_takes_the_robot_file_of_the_working_directory(here: Pa
     assert estop._robot(flags).name == "xrl"
 
 
-def test_a_wheel_says_what_needs_a_checkout_and_its_files_are_not_written_to(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    places.need_checkout("--against")
-    places.refuse_shipped(DEFAULT_CONFIG)
-    monkeypatch.setattr(places, "IS_CHECKOUT", False)
-    monkeypatch.setattr(places, "FILES", tmp_path)
-    with pytest.raises(RunError, match="--against needs a checkout"):
-        places.need_checkout("--against")
-    with pytest.raises(RunError, match="xrl new DIR"):
-        places.refuse_shipped(tmp_path / "robot.gains.json")
-
-
 AS_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="gives a directory to somebody else")
-
-
-@pytest.fixture
-def umask_0() -> Iterator[None]:
-    before = os.umask(0)
-    yield
-    os.umask(before)
 
 
 def mode_of(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
-
-
-@pytest.mark.usefixtures("umask_0")
-def test_shared_memory_is_its_users_alone_whatever_the_umask(tmp_path: Path) -> None:
-    RearmGuard(tmp_path, "knee_left")
-    Neighbours(tmp_path, "knee_left")
-    assert {mode_of(path) for path in live_dir(tmp_path).iterdir()} == {0o600}
 
 
 def test_shared_memory_is_its_users_alone_whatever_the_umask_and_the_mode_before(
@@ -265,24 +219,3 @@ def test_a_strangers_live_directory_is_refused_and_a_strangers_parent_too(tmp_pa
     os.chown(tmp_path / "theirs", 12345, 12345)
     with pytest.raises(FleetError, match="theirs belongs to another user, who can replace it"):
         check_own(tmp_path / "theirs" / "run")
-
-
-def test_memory_that_a_read_only_disk_refuses_is_an_error_that_names_file_and_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-
-    monkeypatch.setattr(run_directory, "open_private", refuse)
-    with pytest.raises(FleetError, match=rf"{tmp_path}/x: .*the disk is read-only: .*`dmesg`"):
-        mapped(tmp_path / "x", 8)
-
-
-def test_the_remedy_can_be_pasted_into_a_shell(tmp_path: Path) -> None:
-    odd = tmp_path / "a #b; c"
-    odd.mkdir()
-    odd.chmod(0o777)
-    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
-        check_own(odd)
-    with pytest.raises(FleetError, match=f"`chmod go-w '{odd}'`"):
-        check_own(odd / "run")

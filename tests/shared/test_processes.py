@@ -116,7 +116,7 @@ def test_a_process_is_pinned_only_where_the_fleets_table_says_so(pinned: str) ->
     assert (same == "True") == (pinned == "1" or count == "1")
 
 
-@pytest.mark.parametrize("first", ["services.planner.planner", "tools.sim.lockstep", "tools.cli"])
+@pytest.mark.parametrize("first", ["services.planner.planner", "tools.cli"])
 def test_linear_algebra_runs_in_one_thread_whatever_is_imported_first(first: str) -> None:
     script = (
         f"import {first}, numpy as np\n"

@@ -23,7 +23,7 @@ from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.messages import Estop
 from shared.bus.security import access_control, services_here, token_key
 from shared.bus.session import open_session
-from shared.bus.tls_probe import LinkWatch, own_fault, refusal
+from shared.bus.tls_probe import LinkWatch, refusal
 from shared.bus.topics import PRINCIPALS, all_keys
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -517,26 +517,6 @@ def test_why_a_link_does_not_come_is_told_truly(pair: Pair, fault: str) -> None:
     assert words in why
     assert bool(words) is bool(why)
     assert refusal(pair.own("planner"), pair.knee) == "Connection refused"
-
-
-@pytest.mark.parametrize(
-    ("when", "words"),
-    [
-        ({}, ""),
-        ({"from_day": 10}, "is not valid yet, by this host's clock"),
-        ({"from_day": -40, "days": 20}, "has expired"),
-        ({"foreign": True}, "is of another authority"),
-    ],
-)
-def test_a_certificate_that_this_host_does_not_believe_is_told(
-    pair: Pair, when: dict[str, int], words: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    pair.replace("planner", **when)  # type: ignore[arg-type]
-    found = own_fault(pair.own("planner"))
-    assert found.startswith(words)
-    assert bool(words) is bool(found)
-    with open_session(pair.host("planner"), "planner", pair.folder):
-        assert ("no link over TLS" in caplog.text) is bool(words)
 
 
 def test_a_service_logs_a_refused_link_once_and_a_session_knows_its_links(

@@ -147,12 +147,6 @@ def test_a_start_of_the_fleet_or_a_host_without_ports_is_no_flood(
     assert arrivals.flood(NS_PER_S) == ""
 
 
-def test_a_kernel_without_these_counters_tells_of_no_flood(tmp_path: Path) -> None:
-    arrivals = Arrivals({7447}, tmp_path)
-    assert arrivals.flood(0) == ""
-    assert arrivals.flood(NS_PER_S) == ""
-
-
 def test_the_other_ends_of_a_process_are_those_of_the_kernel() -> None:
     with ExitStack() as stack:
         listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))

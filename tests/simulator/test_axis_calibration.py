@@ -167,20 +167,6 @@ def test_a_calibration_that_fails_says_why_stops_there_and_leaves_the_axis_uncal
     assert rotor.bank.torque[2] == 0.0
 
 
-def test_a_broken_phase_has_no_resistance_and_a_board_keeps_even_that() -> None:
-    """Saved without a look, the NaN is there after the restart, and no current has gains."""
-    rotor = Rotor()
-    rotor.bank.calibration.resistance[2] = 1e6
-    rotor.ask(MOTOR)
-    rotor.run(0.25)
-    assert rotor.bank.faults[2] == RESISTANCE
-    rotor.bank.settings.save(1)
-    rotor.bank.reboot(2)
-    rotor.wait(1.6)
-    assert math.isnan(rotor.found("motor.config.phase_resistance"))
-    assert rotor.bank.bus.state(1)[0] == pytest.approx(48.0), "no power is computed from it"
-
-
 LOST_INDUCTANCE = AxisErrors(motor=MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE)
 
 
@@ -214,22 +200,6 @@ def test_what_a_request_for_idle_leaves_behind_is_half_a_measurement(
     rotor.bank.reboot(2)
     assert rotor.calibrated == (False, False)
     assert rotor.found("motor.config.phase_resistance") == PHASE_RESISTANCE, "as it was saved"
-
-
-@pytest.mark.parametrize("state", [MOTOR, ENCODER])
-def test_with_an_error_latched_nothing_is_measured_and_nothing_said(state: AxisState) -> None:
-    rotor = Rotor()
-    rotor.bank.calibration.motor[2] = state == ENCODER
-    rotor.bank.estop(2)
-    latched = rotor.bank.faults[2]
-    rotor.ask(state)
-    rotor.run(DT)
-    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, latched)
-    assert rotor.calibrated == (state == ENCODER, False)
-    if state == MOTOR:
-        assert rotor.found("motor.config.phase_resistance") == 0.0
-    else:
-        assert rotor.bank.encoder_turns[2] == pytest.approx(0.28, abs=1e-3), "the zero is gone"
 
 
 def test_a_calibration_ignores_the_input_torque_and_ends_with_an_unfed_watchdog() -> None:

@@ -142,106 +142,6 @@ def test_stepped_at_a_millisecond_the_torque_is_that_of_the_firmwares_own_rate(
     assert not tight or at_limit > 200, "the limits were not reached"
 
 
-GEAR = 17.5
-INERTIA = 0.15 / (2.0 * GEAR**2)
-"""kg m^2 that each of a joint's two motors carries: the joint's armature."""
-FINE = 16_000
-"""Hz of the physics here; divisible by every rate tried."""
-STEP = 0.1
-"""turn"""
-
-
-def motor_gains(k_p: float, k_d: float) -> tuple[float, float]:
-    """Return pos_gain and vel_gain of a motor that has its half of a joint's k_p and k_d."""
-    return k_p / k_d, k_d / (2.0 * GEAR**2) * 2.0 * math.pi
-
-
-def firmware(pos_gain: float, vel_gain: float, seconds: float) -> list[float]:
-    """Return positions at 1 kHz of a motor under the firmware at its own 8 kHz."""
-    axis = FirmwareAxis(0.0, 0.0, counts_per_turn=1 << 22)
-    axis.pos_gain, axis.vel_gain, axis.vel_integrator_gain = pos_gain, vel_gain, 0.0
-    axis.vel_limit, axis.torque_lim, axis.input_pos = 60.0, 60.0 * DRIVE.torque_constant, STEP
-    pos = vel = torque = 0.0
-    track = []
-    for k in range(round(seconds * FINE)):
-        if k % (FINE // 8000) == 0:
-            axis.encoder(pos)
-            torque = axis.control(axis.pos_estimate, axis.vel_estimate)
-        vel += torque / (INERTIA * 2.0 * math.pi) / FINE
-        pos += vel / FINE
-        if k % (FINE // 1000) == 0:
-            track.append(pos)
-    return track
-
-
-def emulated(pos_gain: float, vel_gain: float, seconds: float, rate: int) -> list[float]:
-    """Return the same of the bank, stepped at a rate, its torque held between."""
-    bank = AxisBank(DRIVE, encoder_counts_per_turn=1 << 22, watchdog=False)
-    bank.step(0.0, ZERO, ZERO)
-    close_loop(bank, ControlMode.POSITION, range(1))
-    bank.pos_gain[0], bank.vel_gain[0] = pos_gain, vel_gain
-    bank.input_pos[0] = STEP
-    pos, vel = np.zeros(12), np.zeros(12)
-    torque = bank.step(0.0, pos, vel).copy()
-    track = []
-    for k in range(round(seconds * FINE)):
-        if k and k % (FINE // rate) == 0:
-            torque = bank.step(k / FINE, pos, vel).copy()
-        vel[0] += torque[0] / (INERTIA * 2.0 * math.pi) / FINE
-        pos[0] += vel[0] / FINE
-        if k % (FINE // 1000) == 0:
-            track.append(float(pos[0]))
-    return track
-
-
-@pytest.mark.parametrize(("k_p", "k_d"), [(900.0, 30.0), (1500.0, 60.0), (2000.0, 100.0)])
-def test_stepped_with_the_world_a_stiff_joint_moves_as_under_the_firmwares_own_rate(
-    k_p: float, k_d: float
-) -> None:
-    gains = motor_gains(k_p, k_d)
-    reference = np.array(firmware(*gains, 0.3))
-    worst = {
-        rate: float(np.abs(np.array(emulated(*gains, 0.3, rate)) - reference).max()) / STEP
-        for rate in (1000, 500)
-    }
-    assert worst[1000] < 0.03
-    assert worst[500] > 1.5 * worst[1000], "so the drives must step with the world"
-
-
-def test_a_bank_wants_every_step_of_the_world_only_while_an_armed_axis_has_its_own_loop() -> None:
-    bank = make_bank()
-    assert not bank.regulates
-    bank.set_modes(3, ControlMode.POSITION, InputMode.PASSTHROUGH)
-    bank.step(0.001, ZERO, ZERO)
-    assert bank.regulates
-    bank.request_state(3, AxisState.IDLE)
-    assert not bank.regulates
-
-
-def test_the_integrator_empties_in_torque_mode_and_bandwidths_are_each_axis_s_own() -> None:
-    bank = make_bank(ControlMode.VELOCITY)
-    bank.vel_integrator_gain[:] = 0.5
-    bank.input_vel[:] = 1.0
-    for k in range(1, 50):
-        bank.step(k * 1e-3, ZERO, ZERO)
-    bank.set_modes(0, ControlMode.TORQUE, InputMode.PASSTHROUGH)
-    bank.step(0.05, ZERO, ZERO)
-    bank.set_modes(0, ControlMode.VELOCITY, InputMode.PASSTHROUGH)
-    torque = bank.step(0.051, ZERO, ZERO)
-    assert torque[0] == pytest.approx(bank.vel_gain[0])
-    assert torque[1] > torque[0] + 0.02
-    both = make_bank()
-    both.settings.set(0, "axis1.encoder.config.bandwidth", 200.0)
-    slow = make_bank()
-    slow.settings.fill("encoder.config.bandwidth", 200.0)
-    speed = np.full(12, 5.0)
-    for k in range(1, 10):
-        both.step(k * 1e-3, speed * k * 1e-3, speed)
-        slow.step(k * 1e-3, speed * k * 1e-3, speed)
-    assert both.vel_estimate[1] == pytest.approx(slow.vel_estimate[1], abs=1e-9)
-    assert both.vel_estimate[0] > both.vel_estimate[1] + 0.5
-
-
 @pytest.mark.parametrize("mode", [ControlMode.TORQUE, ControlMode.VELOCITY, ControlMode.POSITION])
 @pytest.mark.parametrize("column", ["input_pos", "input_vel", "input_torque"])
 def test_what_is_no_number_disarms_with_modulation_is_nan(mode: ControlMode, column: str) -> None:
@@ -256,16 +156,6 @@ def test_what_is_no_number_disarms_with_modulation_is_nan(mode: ControlMode, col
     assert bank.faults[1].motor == 0
     assert np.isfinite(torque).all(), "nothing reaches the shaft, in IDLE neither"
     assert np.isfinite(bank.step(bank.now_s + 1e-3, ZERO, ZERO)).all()
-
-
-@pytest.mark.parametrize("limit", [-1.0, math.nan])
-def test_a_current_limit_that_is_negative_or_no_number_disarms(limit: float) -> None:
-    bank = make_bank()
-    bank.input_torque[:] = 0.5
-    bank.current_lim[3] = limit
-    torque = bank.step(bank.now_s + 1e-3, ZERO, ZERO)
-    assert bank.faults[3].motor & MotorError.MODULATION_IS_NAN
-    assert list(np.flatnonzero(torque == 0.0)) == [3]
 
 
 AXIS = 5
@@ -436,27 +326,3 @@ def test_a_lost_encoder_in_idle_is_an_error_and_comes_back_where_it_was_set() ->
     read(bank, Words.TRUE, 2)
     step_for(bank, 0.03)
     assert bank.pos_estimate[2] == pytest.approx(0.0, abs=1e-3)
-
-
-@pytest.mark.parametrize("words", [Words.NONE, Words.ZERO])
-def test_a_drive_that_starts_without_its_encoder_counts_from_zero(words: Words) -> None:
-    bank = idle_bank(np.full(12, 0.2), mark=64.0)
-    read(bank, words, 4)
-    bank.reboot(4)
-    step_for(bank, 0.02, np.full(12, 0.2))
-    assert bank.pos_estimate[4] == 0.0
-    read(bank, Words.TRUE, 4)
-    step_for(bank, 0.1, np.full(12, 0.2))
-    own = 0.2 + bank.encoder_mount[4] / CPR
-    assert bank.pos_estimate[4] == pytest.approx(own - round(own), abs=1e-3)
-
-
-def test_a_rotor_away_from_its_last_word_is_driven_off_phase() -> None:
-    """Seven pole pairs: a quarter of an electrical turn, 1/28 turn, and the torque is none."""
-    bank = quiet_bank()
-    bank.input_torque[:] = 1.0
-    read(bank, Words.NONE)
-    for moved, share in ((1 / 56, math.sqrt(0.5)), (1 / 28, 0.0), (1 / 14, -1.0), (1 / 7, 1.0)):
-        torque = step_for(bank, DT, turned(AXIS, moved))
-        assert torque[AXIS] == pytest.approx(share, abs=0.01)
-        assert torque[AXIS ^ 1] == 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 import tempfile
 from collections import Counter
@@ -125,40 +124,6 @@ def test_requests_are_answered_from_the_registers(benches: Callable[..., Bench])
     assert old.ask(Command.GET_ENCODER_ERROR) == struct.pack("<II", 0x80, 0)
 
 
-def test_0_5_answers_for_its_sensorless_estimator_and_its_pins(old: Bench) -> None:
-    for command in (Command.GET_SENSORLESS_ERROR, Command.GET_SENSORLESS_ESTIMATES):
-        assert old.ask(command) == bytes(8)
-    for pin, volts in ((1, 0.0), (6, -3.3)):
-        old.send(Command.GET_ADC_VOLTAGE, bytes([pin]))
-        assert old.heard()[0][1] == struct.pack("<ff", volts, 0.0)
-    old.send(Command.GET_ADC_VOLTAGE, bytes([9]))
-    assert old.heard() == []
-
-
-@pytest.mark.parametrize("length", [0, 1, 8])
-def test_0_5_answers_requests_of_any_length_only_for_its_controller(
-    old: Bench, length: int
-) -> None:
-    old.bank.inject("knee_right.axis1", "OVERSPEED")
-    old.send(Command.GET_CONTROLLER_ERROR, bytes(length))
-    assert [data for _, data in old.heard()] == [struct.pack("<II", 1, 0)]
-    old.send(Command.GET_MOTOR_ERROR, bytes(length))
-    assert len(old.heard()) == (length == 0)
-
-
-def test_of_requests_at_1_khz_six_in_a_thousand_have_no_answer(old: Bench) -> None:
-    """Those that meet the heartbeats and encoder frames of both axes: three mailboxes are full."""
-    answers = 0
-    count = arbitration_id(NODE, Command.GET_ENCODER_COUNT)
-    for _ in range(2000):
-        old.step()
-        old.front.send_encoders()
-        old.front.send_heartbeats(old.bank.now_s)
-        old.send(Command.GET_ENCODER_COUNT, remote=True)
-        answers += sum(can_id == count for can_id, _ in old.heard())
-    assert 2000 - answers == 12
-
-
 def test_only_its_own_node_changes_a_drive_and_a_current_has_the_calibrated_sign(
     old: Bench,
 ) -> None:
@@ -205,26 +170,6 @@ def test_every_fault_but_the_silent_one_has_a_bit_in_0_6(name: str) -> None:
     assert (errors == DriveError06.NONE) == (name == "DISARM")
 
 
-@pytest.mark.parametrize(
-    ("volts", "result"), [(0.5, "PHASE_RESISTANCE_OUT_OF_RANGE"), (2.0, "NO_RESPONSE")]
-)
-def test_a_heartbeat_of_0_6_says_how_a_calibration_went(
-    new: Bench, volts: float, result: str
-) -> None:
-    """Here no shaft turns."""
-    name = "axis1.motor.config.resistance_calib_max_voltage"
-    new.bank.settings.set(AXIS // 2, name, volts)
-    asked = struct.pack("<I", AxisState.FULL_CALIBRATION_SEQUENCE)
-    new.send(Command.SET_AXIS_STATE, asked)
-    new.step(0.0)
-    assert cansimple_06.unpack_heartbeat(new.heartbeat()).procedure_result == ProcedureResult.BUSY
-    for _ in range(4):
-        new.step(5.0)
-    heartbeat = cansimple_06.unpack_heartbeat(new.heartbeat())
-    assert heartbeat.procedure_result == ProcedureResult[result]
-    assert heartbeat.axis_error == DriveError06.CALIBRATION_ERROR
-
-
 # ---- endpoints
 
 
@@ -253,19 +198,6 @@ def test_an_endpoint_has_its_type_and_is_written_for_its_own_axis(new: Bench) ->
     assert new.bank.vel_limit[AXIS] == 7.5
     assert new.bank.vel_limit[AXIS - 1] == 60.0
     assert struct.unpack("<f", read(new, name)) == (7.5,)
-
-
-def test_an_endpoint_that_does_not_exist_and_a_value_that_is_no_number_change_nothing(
-    new: Bench,
-) -> None:
-    before = new.bank.settings.table(1)
-    new.send(Command06.RX_SDO, cansimple_06.pack_sdo(SdoOpcode.READ, 60_000))
-    nan = struct.pack("<f", float("nan"))
-    number = endpoint("controller.config.vel_limit")
-    new.send(Command06.RX_SDO, cansimple_06.pack_sdo(SdoOpcode.WRITE, number, nan))
-    new.send(Command06.RX_SDO, b"\x01")
-    assert new.heard() == []
-    assert new.bank.settings.table(1) == before
 
 
 @pytest.mark.parametrize("dialect", ["0.5", "0.6"])
@@ -382,15 +314,3 @@ def test_however_the_sensor_is_mounted_the_service_finds_up_and_the_torsos_rates
         reading.up, torso.inv().apply(-gravity / np.linalg.norm(gravity)), atol=2e-4
     )
     np.testing.assert_allclose(reading.rate, (0.5, -1.0, 0.25), atol=4e-3)
-
-
-@pytest.mark.parametrize("slope", [(0.0873, 0.0), (0.0, -0.0873), (0.05, 0.05)])
-def test_on_a_slope_the_hoist_holds_the_com_over_the_ankles_by_gravity(
-    robot: RobotConfig, slope: tuple[float, float]
-) -> None:
-    level = World(body_of(robot, PlantConfig()), still(1.0)).truth(0, 1.0, 0.0)
-    plant = changed(PlantConfig(), {"floor.slope": list(slope)})
-    truth = World(body_of(robot, plant), still(1.0)).truth(0, 1.0, 0.0)
-    assert truth.over == pytest.approx(level.com[:2], abs=1e-3)
-    assert max(truth.foot_left_tilt, truth.foot_right_tilt) < 1e-6
-    assert math.hypot(truth.com[0] - level.com[0], truth.com[1] - level.com[1]) > 0.05

@@ -12,7 +12,6 @@ from services.simulator.drives.axis_faults import AXIS_NAMES, FAULTS, AxisErrors
 from services.simulator.drives.axis_heat import Heat
 from services.simulator.drives.axis_settings import (
     NAMES,
-    PHASE_INDUCTANCE,
     PHASE_RESISTANCE,
     Settings,
     configured,
@@ -20,14 +19,12 @@ from services.simulator.drives.axis_settings import (
 from services.simulator.drives.dc_bus import SUPPLY_RESISTANCE, SUPPLY_VOLTAGE
 from shared.can.cansimple import (
     AxisError,
-    AxisState,
     ControllerError,
     ControlMode,
     InputMode,
     MotorError,
     OdriveError,
 )
-from shared.exceptions import DriveError
 from tests.simulator.banks import (
     CLOSED_LOOP,
     CPR,
@@ -101,24 +98,6 @@ def test_closed_loop_with_an_error_lasts_1_ms_without_torque_and_moves_the_targe
     assert bank.state[3] == CLOSED_LOOP
 
 
-@pytest.mark.parametrize(
-    ("before", "state", "becomes", "error"),
-    [
-        (IDLE, 264, CLOSED_LOOP, 0),
-        (CLOSED_LOOP, 257, IDLE, 0),
-        (CLOSED_LOOP, 512, CLOSED_LOOP, 0),
-        (CLOSED_LOOP, AxisState.HOMING, IDLE, AxisError.INVALID_STATE),
-    ],
-)
-def test_a_state_is_its_low_byte_and_one_that_is_not_emulated_is_invalid(
-    before: AxisState, state: int, becomes: AxisState, error: int
-) -> None:
-    bank = make_bank()
-    bank.request_state(7, before)
-    bank.request_state(7, state)
-    assert (bank.state[7], bank.heartbeat(7).axis_error) == (becomes, error)
-
-
 @pytest.mark.parametrize(("lifting", "spins"), [(40.0, True), (2.0, False)])
 def test_disarmed_while_it_lifts_an_axis_that_sinks_spins_out_in_idle(
     lifting: float, spins: bool
@@ -188,20 +167,6 @@ def test_an_injected_fault_floats_its_axis_alone_but_where_gate_drivers_share_it
     assert (bank.heartbeat(10).errors == 0) == (fault == "DISARM")
 
 
-@pytest.mark.parametrize(
-    ("axis", "fault", "says"),
-    [
-        ("hip_middle.axis0", "DISARM", r"hip_left\.axis1"),
-        ("hip_left.axis0", "FIRE", "OVERSPEED"),
-    ],
-)
-def test_an_unknown_axis_or_fault_is_refused_with_the_known_names(
-    axis: str, fault: str, says: str
-) -> None:
-    with pytest.raises(DriveError, match=says):
-        make_bank().inject(axis, fault)
-
-
 # ---- the current
 
 
@@ -237,30 +202,6 @@ def test_a_bump_under_load_disarms_where_the_emf_drives_the_current_beyond_its_l
     bank = heavy_bank(amperes * KT)
     step_for(bank, 0.005, vel=only(4, speed))
     assert (bank.faults[4] == FAULTS["CURRENT_LIMIT"]) == disarms
-
-
-def test_the_current_that_an_emf_drives_is_that_of_the_loop_at_its_own_rate() -> None:
-    """Winding and PI loop of the firmware at 8 kHz, against the bank's step of a millisecond."""
-    bank = patient_bank()
-    loops = bank._control._loops.reshape(5, 12)
-    rng = np.random.default_rng(5)
-    resistance, inductance, w, fine = 0.1, PHASE_INDUCTANCE, 1000.0, 64
-    period, current, integral, speed, worst, largest = 1.0 / 8000.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(1, 200):
-        target = speed + rng.normal(0.0, 1.0)
-        for cycle in range(8):
-            volts = -current * w * inductance + integral
-            integral -= current * w * resistance * period
-            for sub in range(fine):
-                at = speed + (target - speed) * (cycle + sub / fine) / 8.0
-                emf = 2.0 / 3.0 * KT * 2.0 * math.pi * at
-                current += (volts - resistance * current - emf) / inductance * period / fine
-        speed = target
-        bank.step(k * DT, ZERO, np.full(12, speed))
-        worst = max(worst, abs(loops[2, 0] - current))
-        largest = max(largest, abs(current))
-    assert largest > 4.0
-    assert worst < 0.15 * largest
 
 
 # ---- encoders and restarts
@@ -322,35 +263,6 @@ def test_a_setting_has_its_own_drive_name_and_type() -> None:
     assert math.isinf(float(table["config.dc_max_positive_current"]))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "says"),
-    [
-        ("axis0.controller.config.vel_limits", 1.0, "axis0.controller.config.vel_limit"),
-        ("axis2.controller.config.vel_limit", 1.0, "the nearest is"),
-        ("axis0.motor.config.pole_pairs", 7.5, "int"),
-        ("axis0.controller.config.vel_gain", math.nan, "float"),
-    ],
-)
-def test_a_wrong_name_or_value_is_refused_with_what_would_be_right(
-    name: str, value: float, says: str
-) -> None:
-    with pytest.raises(DriveError, match=says):
-        Settings().set(0, name, value)
-
-
-@pytest.mark.parametrize(("direction", "sign"), [(1, 1.0), (-1, -1.0), (0, 1.0)])
-def test_the_current_has_the_sign_of_the_phases_and_the_torque_has_not(
-    direction: int, sign: float
-) -> None:
-    """Motor::update turns the torque round, and the phases turn it back."""
-    bank = make_bank(torque=KT)
-    bank.settings.set(0, "axis1.encoder.config.direction", direction)
-    torque = step_for(bank, DT)
-    assert torque[:2] == pytest.approx([KT, KT])
-    currents = [bank.settings.current(axis, torque[axis]) for axis in (0, 1)]
-    assert currents == pytest.approx([1.0, sign])
-
-
 def test_the_bank_acts_on_a_setting_from_the_next_step_on() -> None:
     bank = make_bank(torque=2.0)
     bank.settings.set(0, "axis1.motor.config.current_lim", 10.0)
@@ -375,21 +287,6 @@ def loaded_bank(heat: Heat | None = None) -> AxisBank:
     bank.vel_gain[:] = 10.0  # else the velocity limit of torque mode clamps first
     bank.input_torque[:] = 99.0
     return bank
-
-
-def test_a_hot_stage_has_less_current_and_a_warm_winding_draws_more_power() -> None:
-    bank = loaded_bank()
-    bank.heat.force(3, 110.0)  # halfway from 100 to 120
-    torque = step_for(bank, 1.5)
-    assert torque[3] == pytest.approx(HALF, rel=0.01)
-    assert torque[2] == pytest.approx(60.0 * KT)
-    powers = []
-    for warm in (0.0, 60.0):
-        bank = loaded_bank(Heat(warm=warm))
-        bank.input_torque[:] = 1.0
-        step_for(bank, 0.05)
-        powers.append(bank.bus.powers(0)[0])
-    assert powers[1] / powers[0] == pytest.approx(1.0 + 60.0 * 0.00393, rel=1e-3)
 
 
 def test_a_stage_heated_at_once_derates_and_disarms_half_a_second_later() -> None:
@@ -460,18 +357,6 @@ def test_the_bus_current_is_that_of_mechanical_power_and_copper_losses(torque: f
     assert bank.bus.state(3) == (SUPPLY_VOLTAGE, 0.0)
 
 
-@pytest.mark.parametrize("resistor", [False, True], ids=["as configured", "with a brake resistor"])
-def test_a_leg_may_brake(resistor: bool) -> None:
-    bank = make_bank()
-    if resistor:  # it takes the current that would flow back
-        bank.settings.set(2, "config.dc_max_negative_current", -0.01)
-        bank.settings.set(2, "config.enable_brake_resistor", value=True)
-    bank.input_torque[4] = -1.0
-    step_for(bank, 0.03, vel=FAST)
-    assert bank.state[4] == CLOSED_LOOP
-    assert (bank.bus.state(2)[1] == pytest.approx(0.0, abs=1e-9)) == resistor
-
-
 @pytest.mark.parametrize(
     ("resistance", "setting", "limit", "torque", "error"),
     [
@@ -496,18 +381,3 @@ def test_beyond_the_bus_s_limits_both_axes_are_disarmed(
         assert bank.faults[axis].motor & MotorError.SYSTEM_LEVEL
         assert bank.faults[axis].odrive == error
     assert bank.state[6] == CLOSED_LOOP
-
-
-def test_a_sagging_supply_disarms_until_it_is_back() -> None:
-    bank = make_bank()
-    bank.supply(2, 7.0)
-    step_for(bank, DT)
-    bank.clear_errors(4)
-    step_for(bank, DT)
-    assert bank.faults[4].odrive == OdriveError.DC_BUS_UNDER_VOLTAGE
-    bank.supply(2, 48.0)
-    bank.clear_errors(4)
-    bank.request_state(4, CLOSED_LOOP)
-    step_for(bank, DT)
-    assert bank.state[4] == CLOSED_LOOP
-    assert bank.is_responding(4), "it has not been off"

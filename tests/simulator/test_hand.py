@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.simulator.physics import operator as hands
-from services.simulator.physics.operator import BANDWIDTH, LedHand, Operator, Wearer, follow
+from services.simulator.physics.operator import LedHand, Operator, Wearer
 from services.simulator.physics.plant import IDEAL, Person
 from shared.bus.messages import HandLead
 from shared.config.robot_config import RobotConfig
@@ -72,57 +72,6 @@ def test_what_is_no_number_is_ignored(field: str, wrong: float) -> None:
     given = (wrong, 0.0, 0.0) if field == "push" else wrong
     hand.ask(asked(**{"height": 0.9, "pitch": 0.5, field: given}), NOW)
     assert hand.numbers() == before
-
-
-@given(st.booleans(), st.floats(0.7, 1.3), st.floats(-1, 1), st.integers(0, 400))
-def test_a_hand_made_of_the_logs_numbers_goes_on_bit_for_bit(
-    leads: bool, height: float, pitch: float, steps: int
-) -> None:
-    hand = LedHand()
-    hand.ask(asked(leads=leads, height=height, pitch=pitch, push=(5.0, 0.0, 1.0)), NOW)
-    for _ in range(steps):
-        hand.advance(DT)
-    other = LedHand.of_numbers(hand.numbers())
-    for _ in range(200):
-        hand.advance(DT)
-        other.advance(DT)
-        assert other.numbers() == hand.numbers()
-        assert (other.over(NOW), other.push) == (hand.over(NOW), hand.push)
-
-
-RATE_MAX = 0.5
-PLACES = st.floats(-10.0, 10.0)
-
-
-@given(st.lists(st.tuples(PLACES, st.floats(1e-4, 2.0)), max_size=30))
-def test_a_coordinate_never_moves_faster_than_its_limit_whatever_the_step(
-    asked: list[tuple[float, float]],
-) -> None:
-    at = rate = 0.0
-    for wanted, dt in asked:
-        before = at
-        at, rate = follow(wanted, at, rate, RATE_MAX, dt)
-        assert abs(at - before) <= RATE_MAX * dt + 1e-9
-        assert abs(rate) <= RATE_MAX + 1e-9
-        assert math.isfinite(at)
-
-
-@given(PLACES, st.integers(1, 20))
-def test_a_coordinate_arrives_without_overshoot_and_rests(wanted: float, per_10_ms: int) -> None:
-    at, rate, dt = 0.0, 0.0, 0.01 / per_10_ms
-    for _ in range(round((abs(wanted) / RATE_MAX + 20.0 / BANDWIDTH) / dt)):
-        at, rate = follow(wanted, at, rate, RATE_MAX, dt)
-        assert abs(at) <= abs(wanted) + 1e-3
-    assert abs(at - wanted) < 1e-3
-    assert abs(rate) < 1e-2
-
-
-def test_within_its_limit_a_coordinate_is_the_critically_damped_solution() -> None:
-    at, rate, dt, wanted = 0.0, 0.0, 1e-3, 0.01
-    for step in range(1, 1000):
-        at, rate = follow(wanted, at, rate, RATE_MAX, dt)
-        w_t = BANDWIDTH * step * dt
-        assert abs(at - wanted * (1.0 - (1.0 + w_t) * math.exp(-w_t))) < 1e-9
 
 
 LEVEL = Lead(height=1.1, height_rate=0.0, pitch=0.0, pitch_rate=0.0, assist=0.0)

@@ -21,8 +21,7 @@ from services.simulator.physics.plant import (
 )
 from services.simulator.physics.world import World
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import ConfigError
-from tests.lockstep.runs import still, variant
+from tests.lockstep.runs import run, standing_as, still, variant
 from tools.lab.studies.sweeps import plants
 from tools.sim.lockstep import Lockstep
 
@@ -55,22 +54,6 @@ def test_a_plant_written_as_toml_is_read_back(tmp_path: Path) -> None:
     assert load(file) == plant
     file.write_text(to_toml(IDEAL), encoding="utf-8")
     assert load(file) == IDEAL  # a rigid drivetrain has an infinite stiffness
-
-
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("perfect", "realistic"),
-        ("drivetrain.stifness=3000", "drivetrain.stiffness"),
-        ("drivetrain.stiffness=3", "500"),
-        ("encoder.zero_errors=[0.1]", "12"),
-        ("floor.friction=slippery", "TOML"),
-        ("nothing.toml", "not found"),
-    ],
-)
-def test_what_is_no_plant_is_refused_with_what_would_be_right(word: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        plant_from([word])
 
 
 def test_no_controller_sees_the_plant(robot: RobotConfig) -> None:
@@ -211,18 +194,6 @@ def test_energy_only_ever_leaves_a_drivetrain_that_is_not_driven(robot: RobotCon
     assert max(before) < 1.05 * before[0]  # the integrator breathes, it does not feed
 
 
-def test_a_stiff_drivetrain_is_the_rigid_one(robot: RobotConfig) -> None:
-    """The same stand under the same torques, by both kinds of plant."""
-    courses = []
-    for stiffness in (np.inf, 2e5):
-        plant = changed(IDEAL, {"drivetrain.stiffness": stiffness, "steps": 4})
-        world = World(body_of(robot, plant), still(1.0))
-        for _ in range(300):
-            world.step(np.full(12, 0.2))
-        courses.append(world.data.qpos[:3].copy())
-    np.testing.assert_allclose(courses[0], courses[1], atol=1e-4)
-
-
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("stiffness", [2000.0, 20000.0])
 def test_one_step_of_a_millisecond_does_as_well_as_four(
@@ -232,11 +203,13 @@ def test_one_step_of_a_millisecond_does_as_well_as_four(
 
     Within 3 mm: dry friction lets the robot rest anywhere in a band, and the soles no longer creep.
     """
-    coms = []
-    for steps in (1, 4):
-        plant = changed(PlantConfig(), {"drivetrain.stiffness": stiffness, "steps": steps})
-        fleet = Lockstep(robot, still(1.5, height=1.1), plant=plant)
-        coms.append(np.array([row.com for row in fleet.run() if row.scenario_s > 0.0]))
-        assert fleet.world.scenario_s > 1.4
-    n = min(map(len, coms))
-    np.testing.assert_allclose(coms[0][:n], coms[1][:n], atol=3e-3)
+    plants_of = [
+        changed(PlantConfig(), {"drivetrain.stiffness": stiffness, "steps": n}) for n in (1, 4)
+    ]
+    start = standing_as(robot, plants_of[0])
+    coarse, fine = (
+        run(robot, still(0.7, height=1.1), plant=plant, start=start) for plant in plants_of
+    )
+    assert coarse.rows[-1].scenario_s > 0.6
+    n = min(len(coarse.rows), len(fine.rows))
+    np.testing.assert_allclose(coarse.com_mm[:n], fine.com_mm[:n], atol=3.0)

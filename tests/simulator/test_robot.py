@@ -7,19 +7,16 @@ from typing import Any, NamedTuple, cast
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from services.simulator import loop as simulator_loop
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_faults import AXIS_NAMES, BOOT_S, TALKS_S
 from services.simulator.drives.axis_faults import AxisErrors as Registers
 from services.simulator.fronts.cansimple_front import CanSimpleFront
-from services.simulator.loop import SimulatorLoop, SimulatorPorts, granted
+from services.simulator.loop import SimulatorLoop, SimulatorPorts
 from services.simulator.physics.plant import IDEAL
 from services.simulator.physics.world import World
 from services.simulator.robot import FaultInjector, SimulatedRobot
-from shared.bus.messages import OperatorIntent, Vector4
 from shared.can.cansimple import (
     AxisError,
     AxisState,
@@ -167,18 +164,6 @@ def test_after_it_an_axis_stays_as_it_is_until_it_is_cleared_and_asked_to_arm(ki
     assert scene.torque[7] == 1.0, "the trap: the input torque of before is in force again"
 
 
-def test_a_link_lost_for_longer_than_the_watchdog_leaves_both_axes_limp() -> None:
-    scene = Scene(make_fault("link_lost", 0, duration=0.3))
-    scene.run(0.1)
-    assert scene.bank.state[0] == AxisState.CLOSED_LOOP_CONTROL, "it holds its last torque"
-    scene.run(0.2)
-    assert scene.bank.state[:2] == [AxisState.IDLE] * 2
-    assert scene.bank.faults[1].axis == AxisError.WATCHDOG_TIMER_EXPIRED
-    assert not scene.bank.is_responding(0)
-    scene.run(0.32)
-    assert scene.bank.is_responding(0)
-
-
 def test_a_brown_out_ends_in_a_restart_in_idle_with_no_error_and_nothing_remembered() -> None:
     scene = Scene(make_fault("brown_out", 2, duration=0.1), watchdog=False)
     scene.bank.vel_limit[2] = 3.0  # written, and never saved
@@ -319,16 +304,3 @@ def test_a_fault_comes_at_its_time_in_the_scenario_and_not_before_that_begins(
         assert world.time < began + 0.2
     assert world.time - began == pytest.approx(0.1, abs=0.005)
     assert np.flatnonzero([s == AxisState.IDLE for s in bank.state]).tolist() == [8, 9]
-
-
-ANY = st.floats(-1e300, 1e300)
-
-
-@given(ANY, st.tuples(ANY, ANY, ANY, ANY))
-def test_the_person_rests_no_more_than_a_planner_grants(assist: float, shift: Vector4) -> None:
-    assist_max, shift_max = 200.0, (0.02, 0.03, 0.1, 0.2)
-    asked = OperatorIntent(t_ns=1, seq=1, assist_n=assist, shift=shift)
-    force, parts = granted(asked, assist_max, shift_max)
-    assert 0.0 <= force <= assist_max
-    assert force == assist or not 0.0 <= assist <= assist_max
-    assert all(abs(part) <= most for part, most in zip(parts, shift_max, strict=True))

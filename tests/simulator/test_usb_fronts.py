@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import socket
 import struct
@@ -23,7 +22,6 @@ from services.simulator.fronts import usb_standin
 from services.simulator.fronts.fibre_front import CODECS, EmulatedBoard, FibreFront, crc16
 from services.simulator.fronts.fibre_port import CHECK_EVERY, FibreHub, FibrePort
 from shared.can.cansimple import AxisError, AxisState
-from shared.exceptions import FleetError
 from shared.run_directory import live_dir
 from tests.simulator.banks import DRIVE, ZERO, idle_bank
 
@@ -140,23 +138,6 @@ def test_an_exchange_returns_the_value_before_in_at_most_the_bytes_asked_for(
         assert client.operate(number, 4) == b""
 
 
-def test_error_registers_may_be_written_and_what_stands_in_the_axiss_own_disarms_it(
-    client: Client,
-) -> None:
-    bank, axis = client.front.board.bank, 2 * MODULE
-    for each in (axis, axis + 1):
-        bank.request_state(each, AxisState.CLOSED_LOOP_CONTROL)
-    client.exchange("axis0.motor.error", 0x8)
-    assert bank.faults[axis].motor == 0x8
-    assert bank.state[axis] == AxisState.CLOSED_LOOP_CONTROL, "no other register does"
-    client.exchange("axis0.error", 0x40)
-    assert bank.state[axis : axis + 2] == [AxisState.IDLE, AxisState.CLOSED_LOOP_CONTROL]
-    for name in ("axis0.error", "axis0.motor.error"):
-        client.exchange(name, 0)
-    client.exchange("error", 2)
-    assert bank.faults[axis] == bank.faults[axis + 1] == (0, 0, 0, 0, 2)
-
-
 @pytest.mark.parametrize(
     ("flags", "wrong", "written"),
     [(0, 0, 1.5), (ANSWER, 1, 0.0)],
@@ -213,24 +194,6 @@ def test_a_state_and_a_mode_go_to_the_axis_and_one_that_does_not_exist_is_an_err
     assert client.exchange("axis0.controller.config.input_mode") == 1
 
 
-def test_a_function_takes_the_argument_written_before_and_clearing_clears_both_axes(
-    client: Client, bank: AxisBank
-) -> None:
-    counts = client.exchange("axis1.encoder.config.cpr")
-    client.exchange("axis1.encoder.set_linear_count.count", 3 * counts)
-    assert client.exchange("axis1.encoder.pos_estimate") == 0.0
-    client.call("axis1.encoder.set_linear_count")
-    assert client.exchange("axis1.encoder.pos_estimate") == 3.0
-    assert client.exchange("axis0.encoder.pos_estimate") == 0.0
-    before = client.exchange("axis0.controller.config.vel_gain", math.nan)
-    assert client.exchange("axis0.controller.config.vel_gain") == before
-    assert client.front.ignored == 1
-    bank.step(1e3, ZERO, ZERO)
-    assert client.exchange("axis0.error") != 0
-    client.call("clear_errors")
-    assert [client.exchange(f"axis{i}.error") for i in (0, 1)] == [0, 0]
-
-
 def test_the_configuration_is_saved_in_idle_only_and_a_restart_forgets_what_was_not(
     client: Client, bank: AxisBank
 ) -> None:
@@ -244,21 +207,6 @@ def test_the_configuration_is_saved_in_idle_only_and_a_restart_forgets_what_was_
     client.exchange("axis0.controller.config.vel_limit", 9.0)
     client.call("reboot")
     assert bank.settings.get(MODULE, "axis0.controller.config.vel_limit") == 7.0
-
-
-def test_a_mark_of_calibration_is_believed_of_a_motor_and_of_an_encoder_that_is_ready(
-    client: Client,
-) -> None:
-    for name in ("motor.config.pre_calibrated", "encoder.config.pre_calibrated"):
-        client.exchange(f"axis1.{name}", False)
-    client.call("save_configuration")
-    assert client.exchange("axis1.motor.is_calibrated") is False
-    for name in ("motor", "encoder"):
-        client.exchange(f"axis1.{name}.config.pre_calibrated", True)
-    assert client.exchange("axis1.motor.is_calibrated") is True
-    assert client.exchange("axis1.motor.config.pre_calibrated") is True
-    assert client.exchange("axis1.encoder.is_ready") is False
-    assert client.exchange("axis1.encoder.config.pre_calibrated") is False
 
 
 VERSION = struct.pack("<HHHIH", 0x81, 0x8000, 4, 0xFFFF_FFFF, 1)
@@ -319,21 +267,6 @@ def test_a_silent_board_answers_nothing_and_is_unplugged_until_it_is_back(
     assert hub.clients == 0
 
 
-def test_a_plug_that_is_in_again_takes_clients_again(
-    hub: FibreHub, bank: AxisBank, plugged: socket.socket, tmp_path: Path
-) -> None:
-    bank.conditions.link(2, up=False)
-    look(hub)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "3", "4", "5"]
-    bank.conditions.link(2, up=True)
-    look(hub)
-    plugged.connect(str(tmp_path / "2"))
-    look(hub)
-    plugged.send(VERSION)
-    hub.poll()
-    assert plugged.recv(64)
-
-
 def test_the_stand_in_compiles_without_a_warning_and_is_rebuilt_for_a_newer_source(
     tmp_path: Path,
 ) -> None:
@@ -346,30 +279,6 @@ def test_the_stand_in_compiles_without_a_warning_and_is_rebuilt_for_a_newer_sour
     assert list(tmp_path.iterdir()) == [library]
     command = ["cc", "-std=gnu11", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "-c"]
     subprocess.run([*command, "-o", tmp_path / "o", usb_standin.SOURCE], check=True)
-
-
-def test_what_a_compiler_complains_of_is_shown_and_nothing_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    program = tmp_path / "cc"
-    program.write_text("#!/bin/sh\necho no such header >&2; exit 1\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    with pytest.raises(FleetError, match="no such header"):
-        usb_standin.build(tmp_path / "lib")
-    assert list((tmp_path / "lib").iterdir()) == []
-
-
-def test_without_a_compiler_or_a_writable_folder_the_fix_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "lib").write_text("a file")
-    with pytest.raises(FleetError, match="a folder that can be written"):
-        usb_standin.build(tmp_path / "lib")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(FleetError, match="no C compiler `cc` is on PATH; install one"):
-        usb_standin.build(tmp_path / "other")
 
 
 def test_it_prepares_paths_of_its_own_and_clears_them_but_nothing_else(

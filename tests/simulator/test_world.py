@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import msgspec
-import mujoco
 import numpy as np
 import pytest
 
@@ -84,16 +83,6 @@ def test_a_torque_that_resets_mujoco_is_a_fall(
     assert all(map(math.isfinite, (*world.data.qpos, *world.hidden())))
 
 
-def test_a_push_that_resets_mujoco_is_a_fall_with_dense_matrices(robot: RobotConfig) -> None:
-    world = world_of(robot, push=(Push(at=0.0, duration=1.0, force=(1e300, 0.0, 0.0)),))
-    world.start()
-    world.remove_hoist()
-    run(world, 0.01)
-    assert seen(world).fallen
-    # MuJoCo's sparse Newton solver was wrong in 4.0.0 (services/simulator/physics/body.py).
-    assert world_of(robot).model.opt.jacobian == mujoco.mjtJacobian.mjJAC_DENSE
-
-
 def test_motors_and_joints_agree_by_the_differential_and_have_the_same_power(
     robot: RobotConfig,
 ) -> None:
@@ -131,14 +120,13 @@ def test_the_hoist_holds_an_unpowered_robot_which_falls_once_it_is_released(
     robot: RobotConfig,
 ) -> None:
     world = world_of(robot)
-    run(world, 5.0)
+    run(world, 2.0)
     truth = seen(world)
     assert truth.hoist == 1.0
     assert not truth.fallen
     assert truth.torso[2] == pytest.approx(robot.simulation.stand_height, abs=0.03)
     assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 0.01
     assert truth.feet_slip < 5e-3
-    world = world_of(robot)
     world = world_of(robot)
     run(world, 0.5)
     world.release_hoist()
@@ -261,26 +249,3 @@ def test_sideways_the_hand_pulls_the_harness_point_to_where_it_holds_it_against_
     wanted = hand.k_y * (0.03 - y) - hand.b_y * rate
     assert seen(world).operator_force[1] == pytest.approx(wanted, abs=1.0)
     assert abs(wanted) > 5.0
-
-
-def test_truth_counts_up_finite_and_a_fall_is_permanent(robot: RobotConfig) -> None:
-    world = world_of(robot)
-    world.start()
-    for count in range(1, 6):
-        run(world, 0.01)
-        truth = seen(world)
-        assert truth.seq == count
-        assert truth.scenario_s == pytest.approx(0.01 * count)
-        for value in msgspec.structs.astuple(truth):
-            assert np.all(np.isfinite(value))
-    world = world_of(robot)
-    upright = world.data.qpos.copy()
-    world.data.qpos[2] = 0.3
-    run(world, 0.002)
-    assert seen(world).fallen
-    world.data.qpos[:] = upright
-    world.data.qvel[:] = 0.0
-    run(world, 0.002)
-    truth = seen(world)
-    assert truth.torso[2] > 1.0
-    assert truth.fallen

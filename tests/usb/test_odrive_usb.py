@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import logging
 import math
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -18,8 +16,6 @@ import pytest
 from services.joint.drivers import odrive_usb
 from services.joint.drivers.base import DriveReading, MotorTarget
 from services.joint.drivers.odrive_usb import EXCHANGE_HZ, OdriveUsb
-from services.simulator.fronts import fibre_front
-from services.simulator.fronts.fibre_front import endpoints
 from shared.bus.messages import DriveStatus
 from shared.can.cansimple import AxisError, AxisState, ControlMode
 from shared.config.robot_config import RobotConfig
@@ -78,17 +74,6 @@ def test_the_genuine_package_reads_arms_streams_and_meets_a_disarm(usb: UsbRobot
     assert board.axis0.error & AxisError.CONTROLLER_FAILED
     assert board.axis0.controller.error == 1
     assert board.axis0.motor.error != 0
-
-
-def test_the_genuine_package_writes_a_setting_and_saves_it_over_a_restart(usb: UsbRobot) -> None:
-    board = odrive.find_sync(serial_number(MODULE), timeout=10)
-    board.axis1.config.can.encoder_rate_ms = 7
-    board.save_configuration()
-    assert eventually(lambda: not usb.bank.is_responding(5))
-    assert eventually(lambda: usb.bank.is_responding(5))
-    board = odrive.find_sync(serial_number(MODULE), timeout=10)
-    assert board.axis1.config.can.encoder_rate_ms == 7
-    assert board.axis0.config.can.encoder_rate_ms != 7
 
 
 def test_arming_writes_the_limits_and_a_target_runs_the_drives_own_loop_until_idle(
@@ -254,17 +239,6 @@ def test_a_control_loop_that_hangs_lets_the_watchdog_fire(usb: UsbRobot, armed: 
         assert usb.bank.faults[4].axis & AxisError.WATCHDOG_TIMER_EXPIRED
 
 
-def test_without_libusb_the_fix_is_named(
-    config: RobotConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(**_: bool) -> None:
-        raise OSError("libusb-1.0.so.0: cannot open shared object file")
-
-    monkeypatch.setattr(odrive_usb, "get_device_manager", fail)
-    with pytest.raises(DriveError, match=r"the odrive package needs it: .*libusb"):
-        OdriveUsb(serial_number(0), config.drive)
-
-
 def test_close_carries_out_the_last_idle_and_leaves_no_task(
     usb: UsbRobot, armed: Control, drive: OdriveUsb
 ) -> None:
@@ -316,26 +290,6 @@ def test_a_position_set_right_before_arm_comes_before_it(
     assert eventually(lambda: usb.bank.state[4:6] == [closed] * 2)
     assert states == [AxisState.IDLE] * 2
     assert usb.bank.input_pos[4:6].tolist() == pytest.approx([0.5, 0.25], abs=1e-3)
-
-
-def test_a_drive_missing_from_the_bus_is_reported_once_with_its_number_and_one_that_is_there_is_not(
-    usb: UsbRobot,
-    config: RobotConfig,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    with caplog.at_level(logging.WARNING, "xrl"):
-        present = OdriveUsb(serial_number(MODULE), config.drive)
-        assert eventually(lambda: is_status(present.read(0.01), DriveStatus.IDLE))
-        monkeypatch.setattr(odrive_usb, "REPORT_S", 0.1)
-        missing = OdriveUsb("0000000000AB", config.drive)
-        assert eventually(lambda: bool(caplog.records))
-        time.sleep(0.5)
-        present.close()
-        missing.close()
-    assert [record.getMessage().split(";")[0] for record in caplog.records] == [
-        "ODrive 0000000000AB: not on USB"
-    ]
 
 
 LOST = DriveStatus.LOST
@@ -467,22 +421,6 @@ def test_silence_counts_only_while_somebody_reads_and_not_at_once(
     silence = readings[readings.index(None) :]
     assert [reading for reading in silence if reading is not None], "it is lost in the end"
     assert all(reading is None or reading.status == LOST for reading in silence)
-
-
-def test_a_board_that_is_no_v3_is_named_in_trouble(
-    libusb: None, config: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    single = [row for row in endpoints() if not row.name.startswith("axis1")]
-    monkeypatch.setattr(fibre_front, "endpoints", lambda: single)
-    monkeypatch.setenv("XRL_USB", str(tmp_path))
-    with UsbRobot(config, tmp_path).running():
-        drive = OdriveUsb(serial_number(MODULE), config.drive)
-        assert eventually(lambda: "axis1.encoder.pos_estimate" in drive.trouble)
-        assert "firmware 0.5.x" in drive.trouble
-        reading = drive.read(0.0)
-        assert reading is not None
-        assert reading.status is LOST
-        drive.close()
 
 
 @pytest.mark.parametrize("direction", [1, -1])

@@ -134,30 +134,6 @@ def test_whatever_bytes_are_flipped_nothing_breaks_and_nothing_false_is_read(
         read(path)
 
 
-def test_messages_whose_schema_is_lost_are_kept(tmp_path: Path, finished: bytes) -> None:
-    """The schemas stand before the first chunk and in it; with both damaged all was lost."""
-    content = bytearray(finished)
-    content[content.index(b"xrl.JointState") - 6] ^= 0x40  # its number
-    content[content.index(b"zstd") + 60] ^= 0x01
-    path = tmp_path / "flipped.mcap"
-    path.write_bytes(content[: content.rindex(b"zstd")])
-    assert (counted(path), recovered(path)) == (110, 110)
-
-
-def test_a_flip_in_one_chunk_costs_no_other(tmp_path: Path, killed: Killed) -> None:
-    data = killed.path.read_bytes()
-    dice = random.Random(11)
-    path = tmp_path / "flipped.mcap"
-    for _ in range(60):
-        content = bytearray(data)
-        place = dice.randrange(killed.flushed[0][0], len(content))
-        content[place] ^= dice.randrange(1, 256)
-        path.write_bytes(content)
-        found = recovered(path)
-        assert found is not None
-        assert found >= 110
-
-
 def old_version(path: Path) -> None:
     with path.open("wb") as file:
         writer = Writer(file)
@@ -195,29 +171,3 @@ def test_another_version_and_a_foreign_file_are_shown_recovered_and_refused_in_o
         read_run(path).messages(topics.JOINT_STATE, "knee_right")
     assert "\n" not in str(caught.value)
     assert ("schema version 0" in str(caught.value)) == (make is old_version)
-
-
-NO_LOGS: dict[str, bytes | None] = {
-    "absent": None, "empty": b"", "one byte": b"\x89", "text": b"no mcap file at all",
-    "zeros": bytes(200),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("verb", ["info", "recover", "report", "play"])
-@pytest.mark.parametrize("kind", [*NO_LOGS, "directory"])
-def test_what_is_no_log_is_one_line_and_exit_code_2(
-    tmp_path: Path, kind: str, verb: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Devices and pipes are in tests/tools/test_bad_input.py."""
-    path = tmp_path / "x.mcap"
-    content = NO_LOGS.get(kind)
-    if content is not None:
-        path.write_bytes(content)
-    elif kind == "directory":
-        path.mkdir()
-    there = sorted(tmp_path.iterdir())
-    assert cli.main(["log", verb, str(path)]) == 2
-    output = capsys.readouterr()
-    assert len(output.err.splitlines()) == 1
-    assert str(path) in output.err
-    assert sorted(tmp_path.iterdir()) == there

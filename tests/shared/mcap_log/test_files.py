@@ -54,18 +54,3 @@ def test_a_file_that_is_closed_meanwhile_is_synced(
     waiting.settle()
     waiting.close()
     assert disk.synced == 2
-
-
-def test_an_error_of_the_disk_comes_with_the_next_request(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(_descriptor: int) -> None:
-        raise OSError(5, "Input/output error")
-
-    monkeypatch.setattr(files.os, "fsync", fail)
-    failing = FsyncThread()
-    with (tmp_path / "a").open("wb") as file:
-        failing.request(file.fileno())
-        with pytest.raises(OSError, match="Input/output"):
-            failing.settle()
-    failing.close()

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
 
 from services.recorder import auto_recover
 from shared.bus import topics
@@ -36,14 +34,6 @@ def test_a_killed_file_comes_back_whole(tmp_path: Path) -> None:
     assert log.attachments == ATTACHMENTS
     assert log.metadata["recovered"]["from"] == "killed.mcap"
     assert log.messages(topics.JOINT_STATE, "knee_right")[-1] == runs.state(1199)
-
-
-def test_whole_chunks_are_taken_over_byte_for_byte(tmp_path: Path) -> None:
-    killed = runs.killed_file(tmp_path, batches=2)
-    original = killed.path.read_bytes()
-    outcome = recover.recover(killed.path, tmp_path / "out.mcap")
-    start = original.index(b"zstd", killed.flushed[1][0])
-    assert original[start : start + 2000] in outcome.out.read_bytes()
 
 
 def test_the_messages_before_the_cut_in_a_chunk_come_back(tmp_path: Path) -> None:
@@ -75,41 +65,6 @@ def test_garbage_after_a_power_cut_is_no_message(tmp_path: Path) -> None:
     killed.path.write_bytes(data[: start + 30] + bytes(5000))
     outcome = recover.recover(killed.path, tmp_path / "out.mcap")
     assert by_the_package(outcome.out) == list(range(1100))
-
-
-def test_a_recovered_file_recovers_to_the_same(tmp_path: Path) -> None:
-    killed = runs.killed_file(tmp_path)
-    first = recover.recover(killed.path, tmp_path / "a.mcap")
-    second = recover.recover(first.out, tmp_path / "b.mcap")
-    assert second.finished
-    assert by_the_package(second.out) == by_the_package(first.out)
-
-
-@pytest.mark.parametrize("compression", list(CompressionType))
-@pytest.mark.parametrize("chunked", [True, False])
-def test_a_foreign_file_is_recovered_too(
-    tmp_path: Path, compression: CompressionType, chunked: bool
-) -> None:
-    path = tmp_path / "foreign.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=2000, compression=compression, use_chunking=chunked)
-        writer.start("ros2")
-        schema = writer.register_schema("std_msgs/String", "ros2msg", b"string data")
-        channels = [
-            writer.register_channel("/a", "cdr", schema), writer.register_channel("/b", "x", 0)
-        ]  # fmt: skip
-        for seq in range(200):
-            writer.add_message(channels[seq % 2], 1000 + seq, b"\0\1 payload", 7, seq)
-        writer.flush()
-    outcome = recover.recover(path, tmp_path / "out.mcap")
-    assert by_the_package(outcome.out) == list(range(200))
-    with outcome.out.open("rb") as file:
-        reader = make_reader(file)
-        assert reader.get_header().profile == "ros2"
-        names = {
-            channel.topic: schema and schema.name for schema, channel, _ in reader.iter_messages()
-        }
-    assert names == {"/a": "std_msgs/String", "/b": None}
 
 
 def test_a_damaged_original_stays_and_its_recovery_goes_beside_it_once(tmp_path: Path) -> None:

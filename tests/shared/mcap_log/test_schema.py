@@ -82,32 +82,6 @@ def test_every_enumeration_of_the_messages_names_its_values_in_a_schema() -> Non
         assert node["type"] == "integer"
 
 
-class Colour(IntEnum):
-    RED = 3
-
-
-class Inner(msgspec.Struct):
-    x: float
-
-
-class Outer(msgspec.Struct):
-    inner: Inner
-    colour: Colour
-    rows: list[Inner]
-    perhaps: float | None = None
-
-
-def test_nested_structs_enumerations_and_optional_fields_become_flat() -> None:
-    node = schema.json_schema(Outer)
-    inner = {"type": "object", "title": "Inner", "properties": {"x": {"type": "number"}}}
-    properties = node["properties"]
-    assert inner.items() <= properties["inner"].items()
-    assert inner.items() <= properties["rows"]["items"].items()
-    assert properties["colour"] == {"type": "integer", "description": "Colour: 3 RED"}
-    assert properties["perhaps"] == {"type": "number"}
-    assert node["required"] == ["inner", "colour", "rows"]
-
-
 class Matrix(msgspec.Struct):
     rows: tuple[tuple[float, float], tuple[float, float]]
 

@@ -26,20 +26,6 @@ from tests.shared.mcap_log.runs import (
 from tools.logs.run_log import read_run
 
 
-def test_every_recorded_topic_has_a_channel_and_a_schema(tmp_path: Path) -> None:
-    path = runs.write(tmp_path, [item(0)])
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    channels = {channel.topic: channel for channel in summary.channels.values()}
-    assert set(channels) == set(runs.recorded_topics())
-    for key, topic in runs.recorded_topics().items():
-        schema = summary.schemas[channels[key].schema_id]
-        assert (schema.name, schema.encoding) == (f"xrl.{topic.type.__name__}", "jsonschema")
-        assert json.loads(schema.data)["type"] == "object"
-        assert channels[key].message_encoding == "json"
-
-
 def test_metadata_and_attachments_come_before_the_first_chunk(tmp_path: Path) -> None:
     path = runs.write(tmp_path, [item(seq) for seq in range(500)])
     with path.open("rb") as file:
@@ -123,15 +109,6 @@ def test_foreign_keys_and_malformed_payloads_are_counted_and_not_written(tmp_pat
         assert run.malformed == {STATE_KEY: len(bad)}
 
 
-def test_counts_with_gaps_and_restarts_are_written_at_the_end(tmp_path: Path) -> None:
-    path = runs.write(tmp_path, [item(seq) for seq in (0, 1, 4, 0, 1)])
-    with path.open("rb") as file:
-        (counts,) = [r.metadata for r in make_reader(file).iter_metadata() if r.name == "counts"]
-    assert set(counts) == set(runs.recorded_topics())
-    found = json.loads(counts[STATE_KEY])
-    assert (found["count"], found["gaps"], found["missing"], found["restarts"]) == (5, 1, 2, 1)
-
-
 def test_a_full_disk_is_one_run_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = Path("/dev/full")
     opened = []
@@ -144,23 +121,6 @@ def test_a_full_disk_is_one_run_error(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(RunError, match=r"^/dev/full: cannot be written: No space left"):
         runs.writer(tmp_path)
     assert opened[0].closed
-
-
-def test_a_directory_that_cannot_be_made_is_one_run_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match="cannot be created"):
-        runs.writer(tmp_path / "file" / "out")
-
-
-def test_a_block_left_by_an_exception_leaves_a_readable_file_without_summary(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(InterruptedError), runs.writer(tmp_path) as run:  # noqa: PT012
-        run.take_from(Queue([item(0)]), 10)
-        run.flush()
-        raise InterruptedError
-    log = read_run(tmp_path / "run.mcap")
-    assert (log.complete, log.count(STATE_KEY)) == (False, 1)
 
 
 def test_a_split_run_is_one_file_after_the_other_and_each_stands_for_itself(tmp_path: Path) -> None:
@@ -193,13 +153,6 @@ def test_what_is_lost_between_two_files_is_counted_in_the_second(tmp_path: Path)
     ]
     assert [c["count"] for c in counts] == [2, 1]
     assert [c["missing"] for c in counts] == [0, 3]
-
-
-def test_while_no_file_is_open_messages_are_counted_as_left_out(tmp_path: Path) -> None:
-    with runs.writer(tmp_path / "out", begin=False) as run:
-        run.take_from(Queue(item(seq) for seq in range(7)), 100)
-        assert (run.recording, run.left_out, run.messages) == (False, 7, 0)
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_is_locked_while_it_is_written_and_no_more_is_taken_than_asked_for(
