@@ -117,7 +117,6 @@ REFUSALS: Final = {
     "log export LOG --csv t --rate 0": "a number from 0.001 to 10000 Hz",
     "log export LOG --csv t --rate nan": "a number from 0.001 to 10000 Hz",
     "log export LOG --gif x.gif --topic sim/truth": "--topic chooses what is in tables",
-    "log export LOG --csv t --curves": "--curves go beside a picture",
     "log report LOG --from 3 --to 2": "--from 3 --to 2: the first is to be the smaller one",
     "log report LOG -o LOG": "is the record itself",
     "log report LOG -o .": "is a directory",

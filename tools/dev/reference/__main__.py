@@ -18,7 +18,6 @@ PAGES: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "verbs.md": verbs.page,
     "faults.md": faults.page,
     "modes.md": modes.page,
-    "modes.svg": modes.diagram,
 }
 """Lines of the generated files, by name."""
 

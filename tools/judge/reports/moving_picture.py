@@ -1,7 +1,4 @@
-"""The moving picture of a run: the robot from the side and from the front, as an animated GIF.
-
-Beside it curves may grow: the paper's Fig. 7 as an animation.
-"""
+"""The moving picture of a run: the robot from the side and from the front, as an animated GIF."""
 
 from __future__ import annotations
 
@@ -100,12 +97,7 @@ class Caption(NamedTuple):
 
 
 def write_gif(
-    log: RunLog,
-    robot: RobotConfig,
-    path: Path,
-    progress: Callable[[float], None],
-    *,
-    with_curves: bool = False,
+    log: RunLog, robot: RobotConfig, path: Path, progress: Callable[[float], None]
 ) -> int:
     """Draw a run, from its scenario's begin, and return the number of frames.
 
@@ -117,15 +109,11 @@ def write_gif(
         raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
     captions = _captions(log, began)
     images = []
-    curves = Curves(chosen, began) if with_curves else None
     for number, pose in enumerate(chosen):
-        width = SIZE[0] + (WIDTH if curves is not None else 0)
-        image = Image.new("RGB", (width * SCALE, SIZE[1] * SCALE), BACKGROUND)
-        canvas = Canvas(ImageDraw.Draw(image))
-        _draw_frame(canvas, robot, pose, (pose.t_ns - began) / NS_PER_S, captions)
-        if curves is not None:
-            curves.draw(canvas, number)
-        images.append(image.resize((width, SIZE[1]), Image.Resampling.LANCZOS))
+        image = Image.new("RGB", (SIZE[0] * SCALE, SIZE[1] * SCALE), BACKGROUND)
+        seconds = (pose.t_ns - began) / NS_PER_S
+        _draw_frame(Canvas(ImageDraw.Draw(image)), robot, pose, seconds, captions)
+        images.append(image.resize(SIZE, Image.Resampling.LANCZOS))
         progress((number + 1) / len(chosen))
     palette = _palette()
     flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -250,79 +238,3 @@ def _draw_robot(
         canvas.arrow(harness, (0.0, -PX_PER_N * pose.force[2]), HAND_INK)
     if pose.push[axis]:
         canvas.arrow(at(np.array(pose.torso)), (sign * PX_PER_N * pose.push[axis], 0.0), PUSH_INK)
-
-
-WIDTH: Final = 440
-"""By which the picture is wider, px."""
-TOP, HEIGHT, GAP = 66.0, 84.0, 22.0
-LEFT, RIGHT = 64.0, 16.0
-CURVES_X, CURVES_WIDTH = SIZE[0] + LEFT, WIDTH - LEFT - RIGHT
-CURVE_INKS: Final = (HAND_INK, COM_INK)
-
-
-class CurvePanel(NamedTuple):
-    """One panel: what it shows, and its lines' inks."""
-
-    title: str
-    values: Callable[[RobotPose], tuple[float, ...]]
-    names: tuple[str, ...]
-    least: float
-    """Smallest span of its axis."""
-
-
-PANELS: Final = (
-    CurvePanel("COM, mm", lambda pose: (1e3 * pose.com[0], 1e3 * pose.com[1]), ("x", "y"), 20.0),
-    CurvePanel("height, m", lambda pose: (pose.torso[2],), ("torso",), 0.1),
-    CurvePanel("hand, N", lambda pose: (-pose.force[2],), ("robot on hand",), 20.0),
-)
-
-
-class Curves:
-    """All panels of a run."""
-
-    def __init__(self, poses: Sequence[RobotPose], began_ns: int) -> None:
-        self._t = [(pose.t_ns - began_ns) / NS_PER_S for pose in poses]
-        self._columns = [list(zip(*map(panel.values, poses), strict=True)) for panel in PANELS]
-        self._ranges = [
-            _range(columns, p.least) for columns, p in zip(self._columns, PANELS, strict=True)
-        ]
-
-    def draw(self, canvas: Canvas, number: int) -> None:
-        """Draw all curves up to a frame."""
-        for index, panel in enumerate(PANELS):
-            top = TOP + index * (HEIGHT + GAP)
-            low, high = self._ranges[index]
-            for value in (low, high):
-                y = self._y(value, index)
-                canvas.line([(CURVES_X, y), (CURVES_X + CURVES_WIDTH, y)], INK, 0.5)
-                canvas.text((CURVES_X - 46.0, y - 7.0), f"{value:.3g}", INK, 11)
-            canvas.text((CURVES_X, top - 17.0), panel.title, INK, 12)
-            for line, name in enumerate(panel.names):
-                canvas.text((CURVES_X + 90.0 + 60.0 * line, top - 17.0), name, CURVE_INKS[line], 12)
-                values = self._columns[index][line][: number + 1]
-                points = [
-                    (self._x(t), self._y(value, index))
-                    for t, value in zip(self._t, values, strict=False)
-                ]
-                if len(points) > 1:
-                    canvas.line(points, CURVE_INKS[line], 1.6)
-        x, bottom = self._x(self._t[number]), TOP + len(PANELS) * (HEIGHT + GAP) - GAP
-        canvas.line([(x, TOP), (x, bottom)], INK, 0.5)
-        canvas.text((x - 12.0, bottom + 4.0), f"{self._t[number]:.1f} s", INK, 11)
-
-    def _x(self, t: float) -> float:
-        begin, end = self._t[0], self._t[-1]
-        return CURVES_X + CURVES_WIDTH * (t - begin) / max(1e-9, end - begin)
-
-    def _y(self, value: float, index: int) -> float:
-        low, high = self._ranges[index]
-        top = TOP + index * (HEIGHT + GAP)
-        return top + HEIGHT * (high - value) / (high - low)
-
-
-def _range(columns: Sequence[Sequence[float]], least: float) -> tuple[float, float]:
-    """Return a panel's limits: its values and a margin, at least so far apart."""
-    low = min(min(column) for column in columns)
-    high = max(max(column) for column in columns)
-    more = max(0.05 * (high - low), 0.5 * (least - (high - low)))
-    return low - more, high + more
