@@ -181,8 +181,9 @@ REFUSALS: Final = {
     "study robust --slope 40": "--slope: '40': a number from 0 to",
     "study push --duration 0": "--duration: '0': a number of at least",
     "study latency --loss 1.5": "from 0 to 1",
-    "study latency --control mine": "'mine'; some of distributed, diagonal, centralised",
-    "study latency --delay 0-200": "FROM:TO:STEP",
+    "study latency --control mine": "'mine': one of distributed, diagonal, centralised",
+    "study latency --control ,": "name at least one of distributed",
+    "study latency --delay 0-200": "numbers from 0 to 60000 with commas",
     "study latency --lead-easing 2": "lead_easing",
     "study crash --only kill-kne_left": (
         "--only kill-kne_left: no such case; perhaps kill-knee_left, kill-ankle_left, "

@@ -51,7 +51,7 @@ CRASHED: Final = tuple(name for name in SERVICES if name not in ("simulator", *O
 
 
 class CrashVerdict(StrEnum):
-    """How a case came out."""
+    """How a case came out, the best first."""
 
     STOOD = "stood"
     SANK = "sank"
@@ -59,11 +59,6 @@ class CrashVerdict(StrEnum):
     FELL = "fell"
     UNJUDGED = "unjudged"
     """The run could not be carried out to where it can be judged."""
-
-    @property
-    def badness(self) -> int:
-        """0 is best."""
-        return list(CrashVerdict).index(self)
 
 
 class CrashCase(msgspec.Struct, frozen=True, kw_only=True):

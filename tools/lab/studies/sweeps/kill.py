@@ -15,9 +15,7 @@ import msgspec
 import numpy as np
 
 from services.simulator.physics.plant import PlantConfig
-from services.simulator.physics.world import World
-from shared.bus.messages import JointEvent, Message, Mode, PlannerStatus, RunEvent, RunEventKind
-from shared.bus.topics import Topic
+from shared.bus.messages import JointEvent, Mode, PlannerStatus, RunEvent, RunEventKind
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.config import gain_schedule
@@ -26,24 +24,24 @@ from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.extras import require
-from shared.joints import MODULES, SIDES
+from shared.joints import MODULES
 from shared.robot.robot_model import stand_pose
 from tools.flags import Count
 from tools.lab.design import split_program
 from tools.lab.studies.sweeps import plants, pool, study
 from tools.lab.studies.sweeps.figures import (
     NOBODY,
+    CaseRun,
     Ended,
     Ending,
     Observer,
     com_max_mm,
-    ending_of,
     event_steps_nm,
     operator_peak_n,
     parted,
+    run_fleet,
     scalars,
     sole_tilt_max_rad,
-    with_payload,
 )
 from tools.lab.studies.sweeps.plants import DIGITS, SHARE, PushFlags, PushRange, uniform
 from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun, bar
@@ -52,7 +50,6 @@ from tools.live import experiment
 from tools.live.experiment import LawFlags
 from tools.output import Picture, new_figure
 from tools.sim.lockstep import Lockstep
-from tools.sim.virtual_services import Record
 from tools.terminal import Console
 
 PAYLOADS: Final = 5
@@ -149,6 +146,12 @@ def payloads(robot: RobotConfig) -> tuple[float, ...]:
     """Return the payloads that are drawn from, kg."""
     highest = robot.mass.payload_max
     return tuple(round(highest * i / (PAYLOADS - 1), DIGITS) for i in range(PAYLOADS))
+
+
+def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
+    """Return the robot with another payload, kg; its gain schedule may then be stale."""
+    mass = msgspec.structs.replace(robot.mass, payload=payload)
+    return msgspec.structs.replace(robot, mass=mass)
 
 
 class KillCases:
@@ -299,117 +302,48 @@ class KillResult(Ended, frozen=True, kw_only=True):
     """Largest distance of an ankle from its first place, mm."""
 
 
-class KillRecorder:
-    """Collects from the messages what the verdict needs, and passes all of them on."""
-
-    def __init__(self, on_to: Record) -> None:
-        self._on_to = on_to
-        self.kill_ns: int | None = None
-        self.status: PlannerStatus | None = None
-        """The planner's last."""
-        self.fallen = False
-        """From then on nothing counts."""
-
-    def __call__(self, topic: Topic, module: str, message: Message) -> None:
-        """Take a message as the bus would."""
-        if isinstance(message, PlannerStatus) and not self.fallen:
-            self.status = message
-        elif isinstance(message, RunEvent) and message.kind == RunEventKind.KILLED:
-            self.kill_ns = message.t_ns
-        self._on_to(topic, module, message)
-
-
 def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) -> KillResult:
     """Run a case to its end or to the fall, and measure it.
 
     The robot has the case's payload and a gain schedule that fits (`robots_of`).
     """
-    monitor = KillRecorder(observer.record)
-    fleet = Lockstep(
-        robot,
-        case.scenario(robot),
-        Impairment(delay_ms=case.delay_ms),
-        seed=case.number,
-        record=monitor,
-        plant=case.true_plant(),
-    )
-    feet = FootLoads(fleet.world)
-    rows: list[SimTruth] = []
-    loads: list[float] = []
 
-    def let_go_in_time(row: SimTruth) -> None:
+    def let_go_in_time(fleet: Lockstep, row: SimTruth) -> None:
         if case.let_go_s is not None and row.scenario_s >= case.let_go_s:
             fleet.world.let_go()
-        observer.watch(row)
 
-    for row in observer._replace(watch=let_go_in_time).rows_that_count(fleet.run(), 0.0):
-        rows.append(row)
-        monitor.fallen = row.fallen
-        loads.append(min(feet.read()))
-    return measure(case, rows, loads, fleet.events, monitor, robot)
-
-
-class FootLoads:
-    """The normal force under each foot."""
-
-    def __init__(self, world: World) -> None:
-        """Find the soles."""
-        self._data = world.data
-        self._soles = [world.model.geom(f"sole_{side}").id for side in SIDES]
-
-    def read(self) -> tuple[float, float]:
-        """Return (right, left), N.
-
-        With the model's elliptic friction cones a contact's first constraint force is its
-        normal force.
-        """
-        contact, force = self._data.contact, self._data.efc_force
-        loads = [0.0, 0.0]
-        for (a, b), address in zip(contact.geom, contact.efc_address, strict=True):
-            for foot, sole in enumerate(self._soles):
-                if sole in (a, b) and address >= 0:
-                    loads[foot] += float(force[address])
-        return loads[0], loads[1]
+    network = Impairment(delay_ms=case.delay_ms)
+    run = run_fleet(
+        case, robot, observer, network, seed=case.number, kept=(PlannerStatus, RunEvent),
+        each=let_go_in_time,
+    )  # fmt: skip
+    return measure(case, run, robot)
 
 
-def measure(
-    case: KillCase,
-    rows: list[SimTruth],
-    loads: list[float],
-    events: list[tuple[str, JointEvent]],
-    monitor: KillRecorder,
-    robot: RobotConfig,
-) -> KillResult:
-    """Return the figures of a run, by the world since it began and all messages.
-
-    `loads` has for each row the load of the lighter foot, N.
-    """
-    if not rows or rows[0].scenario_s < 0.0:
-        return KillResult(ending=Ending.FELL if rows else Ending.UNREADY)
-    last = rows[-1]
-    events = [row for row in events if row[1].t_ns <= last.t_ns]
+def measure(case: KillCase, run: CaseRun, robot: RobotConfig) -> KillResult:
+    """Return the figures of a run."""
+    rows, events, _ = run
+    figures = run.ended(case.end_s, robot)
+    if not run.began:
+        return KillResult(**figures)
     before = [row for row in rows if row.scenario_s < case.kill_s]
-    figures: dict[str, float] = {}
     if before:
         figures["operator_peak_before_n"] = operator_peak_n(before)
         figures["com_before_max_mm"] = com_max_mm(before)
+    killed = [m.t_ns for _, m in run.messages
+              if isinstance(m, RunEvent) and m.kind == RunEventKind.KILLED]  # fmt: skip
     after = [row for row in rows if row.scenario_s >= case.kill_s]
-    if after and monitor.kill_ns is not None:
-        figures |= _after(after) | _handover(events, monitor.kill_ns)
-        figures["foot_load_min_n"] = min(loads[-len(after) :])
-    if monitor.status is not None:
-        figures["kill_margin"] = monitor.status.margin
-        figures["kill_margin_onboard"] = monitor.status.margin_onboard
-    until_ns = monitor.kill_ns if monitor.kill_ns is not None else last.t_ns
-    return KillResult(
-        ending=ending_of(last, case.end_s, robot),
-        fell_at_s=last.scenario_s if last.fallen else None,
-        holds_before=_drop_outs(events, rows[0].t_ns, until_ns),
-        **figures,
-    )
+    if after and killed:
+        figures |= _after(after) | _handover(events, killed[0])
+    statuses = [message for _, message in run.messages if isinstance(message, PlannerStatus)]
+    if statuses:
+        figures["kill_margin"] = statuses[-1].margin
+        figures["kill_margin_onboard"] = statuses[-1].margin_onboard
+    until_ns = killed[0] if killed else rows[-1].t_ns
+    return KillResult(holds_before=_drop_outs(events, rows[0].t_ns, until_ns), **figures)
 
 
-def _after(rows: list[SimTruth]) -> dict[str, float]:
+def _after(rows: Sequence[SimTruth]) -> dict[str, float]:
     x, y = 1e3 * np.array([row.over for row in rows]).T
     return {
         "kill_height_m": rows[0].torso[2],
@@ -419,6 +353,9 @@ def _after(rows: list[SimTruth]) -> dict[str, float]:
         "com_y_min_mm": float(y.min()),
         "com_y_max_mm": float(y.max()),
         "com_max_mm": com_max_mm(rows),
+        "foot_load_min_n": min(
+            min(row.foot_right_force[2], row.foot_left_force[2]) for row in rows
+        ),
         "roll_max_rad": max(abs(row.angles[0]) for row in rows),
         "yaw_max_rad": max(abs(row.angles[2]) for row in rows),
         "sole_tilt_max_rad": sole_tilt_max_rad(rows),
@@ -426,14 +363,14 @@ def _after(rows: list[SimTruth]) -> dict[str, float]:
     }
 
 
-def _drop_outs(events: list[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> int:
+def _drop_outs(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> int:
     count = dict.fromkeys(MODULES, 0)
     for module, event in events:
         count[module] += from_ns <= event.t_ns < to_ns and _into_hold(event)
     return max(count.values())
 
 
-def _handover(events: list[tuple[str, JointEvent]], kill_ns: int) -> dict[str, float]:
+def _handover(events: Sequence[tuple[str, JointEvent]], kill_ns: int) -> dict[str, float]:
     late = {m: e for m, e in reversed(events) if e.t_ns >= kill_ns and _into_hold(e)}
     figures = {}
     if len(late) == len(MODULES):

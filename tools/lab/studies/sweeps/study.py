@@ -11,17 +11,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import Annotated, Any, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from services.simulator.physics.plant import PlantConfig
 from shared.bus.traces import SimTruth
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
 from shared.extras import require
 from shared.places import DEFAULT_CONFIG
@@ -29,6 +27,7 @@ from tools.flags import Arg, ConfigFlags, Count, Folder, Natural, fields_of
 from tools.lab.studies.sweeps import plants, pool
 from tools.lab.studies.sweeps.figures import (
     EXIT_CODES,
+    Case,
     Ending,
     Observer,
     parted,
@@ -46,20 +45,6 @@ FALLS_SHOWN: Final = 10
 FALL_COLOUR: Final = "#c0392b"
 NOT_THE_STUDY: Final = ("n", "config", "seed", "only", "workers", "cluster", "out")
 """Flags that `command_of` leaves out, or writes apart."""
-
-
-class Case(Protocol):
-    """A drawn case: everything that decides its run, beside the robot."""
-
-    @property
-    def number(self) -> int:
-        """Its number, from 0 on."""
-
-    def scenario(self, robot: RobotConfig) -> Scenario:
-        """Return what happens."""
-
-    def true_plant(self) -> PlantConfig:
-        """Return the simulated robot."""
 
 
 C = TypeVar("C", bound=Case)

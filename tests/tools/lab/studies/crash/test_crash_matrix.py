@@ -15,10 +15,9 @@ from shared.config.scenarios import Kill
 from shared.joints import MODULES
 from tests.tools.exit_codes import exit_code as exit_code_of
 from tools.fleet.supervisor_client import ServiceInfo
-from tools.lab.studies.crash import matrix, outcome
+from tools.lab.studies.crash import matrix
 from tools.lab.studies.crash.cases import CASES, CrashCase, CrashVerdict, scenario_of
-from tools.lab.studies.crash.matrix import exit_code, row_of, select, show
-from tools.lab.studies.crash.outcome import CrashResult
+from tools.lab.studies.crash.matrix import CrashResult, exit_code, row_of, select, show
 from tools.lab.studies.sweeps.table import Row
 from tools.live.scenario_runner import ScenarioRunner, TriggeredKill
 from tools.terminal import Console
@@ -43,9 +42,9 @@ def run_with(
         (out / "run.mcap").write_bytes(b"log")
         return outcomes.pop(0)
 
-    monkeypatch.setattr(outcome, "_run_once", once)
+    monkeypatch.setattr(matrix, "_run_once", once)
     out = tmp_path / "case"
-    return outcome.run_case(case, robot, out, print), list(out.glob("*.mcap"))
+    return matrix.run_case(case, robot, out, print), list(out.glob("*.mcap"))
 
 
 def test_a_disturbed_run_is_made_once_more(
@@ -94,9 +93,9 @@ def test_a_service_that_ends_by_itself_is_distinguished_from_one_that_was_killed
     killed, back = RunEventKind.KILLED, RunEventKind.RESTARTED
     events = [done(killed, "planner"), done(killed, "hip_left"), done(back, "hip_left")]
     as_told = [service("planner", up=False), service("hip_left", up=True, restarts=1)]
-    assert outcome.died_of([*as_told, service("harness", up=True)], events) == []
+    assert matrix.died_of([*as_told, service("harness", up=True)], events) == []
     services = [service("harness", up=True, restarts=1), service("hip_left", up=False)]
-    assert outcome.died_of(services, events) == ["harness", "hip_left"]
+    assert matrix.died_of(services, events) == ["harness", "hip_left"]
 
 
 def test_what_is_chased_is_killed_once_as_the_modules_track_again(

@@ -24,8 +24,7 @@ from tools.lab.studies.crash.cases import (
     CrashVerdict,
     scenario_of,
 )
-from tools.lab.studies.crash.matrix import is_good, row_of
-from tools.lab.studies.crash.outcome import CrashMessages, measure
+from tools.lab.studies.crash.matrix import CrashMessages, is_good, measure, row_of
 
 BY_NAME = {case.name: case for case in CASES}
 PLANNER = BY_NAME["kill-planner"]

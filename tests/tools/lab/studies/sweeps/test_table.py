@@ -92,7 +92,6 @@ def test_a_folder_of_other_inputs_is_refused(tmp_path: Path) -> None:
     "damaged",
     [
         b"x,1,0.5,stood,\r\n",
-        b"-2,1,0.5,stood,\r\n",
         b"2,1,0.x,stood,\r\n",
         b"2,1,0.5,stoood,\r\n",
         b"2,1,0.5,,\r\n",
