@@ -47,18 +47,6 @@ def test_each_cold_call_is_prepared_then_follows_a_sweep_and_a_sleep(
     assert calls == ["before", "sleep", "once"] * 2
 
 
-@pytest.mark.parametrize("kept", [False, True])
-def test_lockstep_has_a_speed_with_and_without_a_record_beyond_a_run_too(
-    robot: RobotConfig, monkeypatch: pytest.MonkeyPatch, kept: bool
-) -> None:
-    monkeypatch.setattr(parts, "SECONDS", 0.15)
-    monkeypatch.setattr(parts, "PIECE_S", 0.1)
-    squat = scenarios.load(scenario_file("squat"))
-    with ExitStack() as stack:
-        run = parts.LockstepRun(robot, squat, stack, recorded=kept)
-        assert all(run.speed() > 0.05 for _ in range(3))
-
-
 def test_a_turn_has_every_figure(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts, "SECONDS", 0.15)
     monkeypatch.setattr(parts, "PIECE_S", 0.05)
