@@ -15,7 +15,6 @@ import msgspec
 
 from services.joint.controller import ControllerState
 from services.joint.drive_manager import DriveManager, DriveManagerState
-from services.joint.heat import report
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner, PlannerState
@@ -297,21 +296,6 @@ class Lockstep:
         hand = msgspec.structs.replace(hand, t_ns=self.now_ns, seq=self._progress.led)
         self.world.take_hand(hand)
         self._record(topics.OPERATOR_HAND, "", hand)
-
-    def skip_heat(self, seconds: float) -> None:
-        """Let time pass for the temperatures alone, true and estimated, under the present load.
-
-        For a pose that is held: thermal time constants are minutes.
-        """
-        heat = self.bank.heat
-        while seconds > 0.0:
-            step_s = min(1.0, seconds)
-            heat.skip(heat.load, step_s)
-            for joint in self.joints:
-                estimate, state = joint.manager.controller.heat, joint.manager.state.controller.heat
-                estimate.skip(state, step_s)
-                report(state, *joint.drive.thermistors())
-            seconds -= step_s
 
     def act(self, row: Happening) -> None:
         """Carry out a row of the scenario, or of somebody who looks on, and record it."""

@@ -1,4 +1,4 @@
-"""Runs in virtual time, recorded into `run.mcap` and judged by that log alone."""
+"""Runs in virtual time, recorded into `run.mcap`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ from shared.config.scenarios import Scenario
 from shared.mcap_log import provenance
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.robot_model import mjcf
-from tools.judge.figure import judge_run
-from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow
 from tools.sim.centralised import CONTROLS, SHIPPED
@@ -75,7 +73,7 @@ def record_run(
     true_plant: PlantConfig,
     attached: Sequence[tuple[str, Path]] = (),
 ) -> Outcome:
-    """Record one run into `run.mcap` with its inputs beside it.
+    """Record one run into `run.mcap` with its inputs beside it, and return what `run` returned.
 
     Args:
         scenario: what happens.
@@ -86,9 +84,6 @@ def record_run(
         watch: sees the world at its rate.
         true_plant: that `run` simulates.
         attached: names and files that go into the log as well.
-
-    Returns:
-        What `run` returned.
 
     Raises:
         RunError: the log cannot be written.
@@ -190,17 +185,3 @@ def simulate(
     if controller is not None:
         metadata["controller"] = controller
     return record_run(scenario, robot, out, metadata, run, watch, true_plant, attached)
-
-
-def judge_in_lockstep(scenario: Scenario, out: Path, speed: float | None = None) -> Summary:
-    """Judge a run in virtual time.
-
-    Args:
-        scenario: what happened.
-        out: folder of `run.mcap`.
-        speed: of the simulation, as a multiple of real time.
-
-    Raises:
-        RunError: the log holds nothing to judge, or a file cannot be written.
-    """
-    return judge_run(out, f"{scenario.name} in lockstep", scenario.duration, speed=speed)

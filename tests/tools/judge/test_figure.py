@@ -76,6 +76,6 @@ def test_ages_while_impaired_and_otherwise_are_separate(impaired: RunLog) -> Non
     assert otherwise is not None
     assert otherwise.median <= otherwise.p99 < 20.0
     assert 25.0 <= late.median <= late.p99
-    links = [row.link for row in summary.impairments]
+    links = [line.split()[0] for line in summary.impairments]
     assert links == ["planner->joints", "planner->left", "all"]
     assert summary.links_impaired == 3

@@ -24,6 +24,7 @@ from shared.exceptions import RunError
 from shared.extras import require
 from shared.places import DEFAULT_CONFIG
 from tools.flags import Arg, ConfigFlags, Count, Folder, Natural, fields_of
+from tools.judge.figure import judge_run
 from tools.lab.studies.sweeps import plants, pool
 from tools.lab.studies.sweeps.figures import (
     EXIT_CODES,
@@ -38,7 +39,7 @@ from tools.lab.studies.sweeps.figures import (
 from tools.lab.studies.sweeps.table import CaseTable, Row, plain
 from tools.live import experiment
 from tools.output import Picture, save_figure
-from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
+from tools.sim.recorded_lockstep import AFTER_FALL_S, record_run
 from tools.terminal import Console, marked
 
 FALLS_SHOWN: Final = 10
@@ -226,7 +227,7 @@ def _run_alone(study: Study[C], begun: StudyRun, case: C) -> int:
                 watch,
                 case.true_plant(),
             )
-            judge_in_lockstep(scenario, out)
+            judge_run(out, f"{scenario.name} in lockstep", scenario.duration)
     show("Measured", msgspec.structs.asdict(figures), console)
     if out is not None:
         console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
