@@ -139,7 +139,7 @@ class Lockstep:
         self.plant = plant or PlantConfig()
         self.events: list[tuple[str, JointEvent]] = []
         self.time = time = VirtualTime(NS_PER_S)
-        self._record, self._traced, self._controller = record, traced, controller
+        self._record, self._traced = record, traced
         self.network = network_ = VirtualNetwork(
             network or BASE,
             scenario.inject,
@@ -161,8 +161,18 @@ class Lockstep:
             config, robot, frames, network_, record, time=time, clock=clock_of["imu"]
         )
         self._memory = SharedMemory()
+
+        def new_planner(session: int) -> Planner:
+            if controller is None:
+                return self.planner_type(config, session)
+            return Planner(config, session, controller())
+
+        def request() -> OperatorRequest:
+            wanted = robot.world.lead()
+            return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
+
         self._planner = VirtualPlanner(
-            config, self._new_planner, self._request, network_, record,
+            config, new_planner, request, network_, record,
             time=time, clock=clock_of["planner"], traced=traced,
             beside=self._memory if planner_beside else None,
         )  # fmt: skip
@@ -264,7 +274,9 @@ class Lockstep:
             for bus in self.buses.values():
                 bus.advance(now)
             robot.step_drives()
-            self._cycle_joints()
+            for joint in self.joints:
+                if not joint.frozen and (event := joint.cycle().event) is not None:
+                    self.events.append((joint.name, event))
         elif self.bank.regulates:
             robot.step_drives()
         self.harness.advance()
@@ -273,22 +285,6 @@ class Lockstep:
         self._start_when_tracking(now)
         robot.step_world()
         self.time.now_ns += robot.every.step
-
-    def _new_planner(self, session: int) -> Planner:
-        if self._controller is None:
-            return self.planner_type(self.config, session)
-        return Planner(self.config, session, self._controller())
-
-    def _request(self) -> OperatorRequest:
-        wanted = self.world.lead()
-        return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
-
-    def _cycle_joints(self) -> None:
-        for joint in self.joints:
-            if not joint.frozen:
-                event = joint.cycle().event
-                if event is not None:
-                    self.events.append((joint.name, event))
 
     def lead(self, hand: HandLead) -> None:
         """Let somebody lead the hand in place of the scenario, and record it."""
@@ -307,7 +303,9 @@ class Lockstep:
             detail = f"{x:g},{y:g},{z:g} N for {row.duration:g} s"
             self._put_event(RunEventKind.PUSHED, "torso", detail)
             return
-        service = self._planner if row.service == "planner" else self._joint_named(row.service)
+        service = (
+            self._planner if row.service == "planner" else self.joints[MODULE_INDEX[row.service]]
+        )
         if isinstance(row, Kill):
             self._put_event(RunEventKind.KILLED, row.service, row.signal)
             service.kill(for_good=row.signal != "STOP")
@@ -338,9 +336,6 @@ class Lockstep:
             scenario_s=self.world.scenario_s,
         )
         self._record(topics.RUN_EVENT, "", event)
-
-    def _joint_named(self, name: str) -> VirtualJoint:
-        return self.joints[MODULE_INDEX[name]]
 
     @staticmethod
     def _check_kills(config: RobotConfig, scenario: Scenario) -> None:

@@ -11,6 +11,7 @@ from shared.bus.traces import LinkEvent
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.scenarios import Inject
+from shared.links import WRENCHES
 from tools.sim.network import BASE, VirtualLink, VirtualNetwork
 
 
@@ -206,7 +207,7 @@ def test_an_impairment_that_lasts_to_the_end_of_a_run_reports_its_counts_then() 
     )
     made.advance(0.0, 0)
     for number in range(5):
-        made.wrenches().put(number, message(number))  # type: ignore[arg-type]
+        made.links[WRENCHES].put(number, message(number))
     made.end(7 * NS_PER_MS)
     begun, ended = told
     assert (begun.active, ended.active) == (True, False)

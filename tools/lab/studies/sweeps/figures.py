@@ -17,14 +17,15 @@ from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Scenario
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
+from shared.extras import late
 from tools.judge.standing import why_not_standing
 from tools.lab.studies.sweeps.table import Row
 from tools.sim.lockstep import Lockstep, Watch, forget
 from tools.sim.virtual_services import Record
 
+stats = late("scipy.stats")
+
 END_TOLERANCE_S: Final = 0.1
-Z_95: Final = 1.959964
-"""Two-sided 95 % of a normal distribution, in standard deviations."""
 
 
 class Observer(NamedTuple):
@@ -227,10 +228,8 @@ def wilson(hits: int, of: int) -> tuple[float, float]:
         hits: how often it was so.
         of: trials, independent of each other; at least 1.
     """
-    share, z2 = hits / of, Z_95 * Z_95
-    middle = (share + z2 / (2 * of)) / (1.0 + z2 / of)
-    half = Z_95 / (1.0 + z2 / of) * math.sqrt(share * (1.0 - share) / of + z2 / (4 * of * of))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    interval = stats.binomtest(hits, of).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def parted(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:

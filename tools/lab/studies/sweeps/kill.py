@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import JointEvent, Mode, PlannerStatus, RunEvent, RunEventKind
+from shared.bus.messages import JointEvent, PlannerStatus, RunEvent, RunEventKind
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.config import gain_schedule
@@ -27,6 +27,7 @@ from shared.extras import require
 from shared.joints import MODULES
 from shared.robot.robot_model import stand_pose
 from tools.flags import Count
+from tools.fleet.stalls import goes_to_hold
 from tools.lab.design import split_program
 from tools.lab.studies.sweeps import plants, pool, study
 from tools.lab.studies.sweeps.figures import (
@@ -366,22 +367,18 @@ def _after(rows: Sequence[SimTruth]) -> dict[str, float]:
 def _drop_outs(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> int:
     count = dict.fromkeys(MODULES, 0)
     for module, event in events:
-        count[module] += from_ns <= event.t_ns < to_ns and _into_hold(event)
+        count[module] += from_ns <= event.t_ns < to_ns and goes_to_hold(event)
     return max(count.values())
 
 
 def _handover(events: Sequence[tuple[str, JointEvent]], kill_ns: int) -> dict[str, float]:
-    late = {m: e for m, e in reversed(events) if e.t_ns >= kill_ns and _into_hold(e)}
+    late = {m: e for m, e in reversed(events) if e.t_ns >= kill_ns and goes_to_hold(e)}
     figures = {}
     if len(late) == len(MODULES):
         figures["hold_ms"] = max(event.t_ns - kill_ns for event in late.values()) / NS_PER_MS
     if late:
         figures["torque_step_nm"] = max(event_steps_nm(late.values()))
     return figures
-
-
-def _into_hold(event: JointEvent) -> bool:
-    return event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
 
 
 def robots_of(
@@ -397,7 +394,8 @@ def robots_of(
     """
     weights = sorted({case.payload_kg for case in cases})
     ready = {weight: with_payload(robot, weight) for weight in weights}
-    tasks = [weight for weight in weights if needs_schedule(ready[weight])]
+    certified = robot.law.split == "certified"
+    tasks = [weight for weight in weights if certified and gain_schedule.why_stale(ready[weight])]
     if tasks:
         require("design")
         solved = pool.results(
@@ -413,11 +411,6 @@ def robots_of(
                 ready[loaded.mass.payload] = made
                 shown.update(line, advance=1)
     return [ready[case.payload_kg] for case in cases]
-
-
-def needs_schedule(robot: RobotConfig) -> bool:
-    """Return True if the robot's gain split uses a schedule and its own does not fit."""
-    return robot.law.split == "certified" and bool(gain_schedule.why_stale(robot))
 
 
 def _solve(robot: RobotConfig) -> GainSchedule:

@@ -105,7 +105,7 @@ def lost(robot: RobotConfig, of: int, **network: float) -> set[int]:
     t = trial(network=Network(**({"delay_ms": 0.0, "jitter_ms": 0.0} | network)))
     links = Lockstep(robot, t.scenario(robot), seed=t.draw.fleet_seed).network
     links.advance(3.0, 10**9)
-    direction = links._links["planner->ankle_left"].direction
+    direction = links.links["planner->ankle_left"].direction
     return {number for number in range(of) if not direction.passes(10**9, 0)}
 
 
@@ -164,7 +164,7 @@ def test_all_links_take_the_delay_that_was_asked_for(robot: RobotConfig) -> None
     fleet.network.advance(3.0, 10**9)
     releases = {
         name: link.direction.passes(10**9, 0)[0] - 10**9
-        for name, link in ((n, fleet.network._links[n]) for n in DIRECTIONS)
+        for name, link in ((n, fleet.network.links[n]) for n in DIRECTIONS)
     }
     assert set(releases.values()) == {30_000_000}
 

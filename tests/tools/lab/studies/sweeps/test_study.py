@@ -15,12 +15,12 @@ import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
+from shared.exceptions import FELL_EXIT_CODE, RunError
 from tests.tools.lab.studies.sweeps.tables import TOY, ToyFlags, rows_of, sleep, square, sweep
 from tests.waiting import comes_true
 from tools import cli
 from tools.lab.studies.sweeps import pool, push, study
-from tools.lab.studies.sweeps.figures import Ending, wilson, worst
+from tools.lab.studies.sweeps.figures import worst
 from tools.lab.studies.sweeps.kill import KillCases
 from tools.verb_table import Verb
 
@@ -232,19 +232,6 @@ def test_the_push_study_is_tabled_and_drawn(
 
 
 @pytest.mark.parametrize(
-    ("ending", "code"),
-    [
-        (Ending.STOOD, 0),
-        (Ending.UNREADY, FAULT_EXIT_CODE),
-        (Ending.TIPPING, FELL_EXIT_CODE),
-        (Ending.FELL, FELL_EXIT_CODE),
-    ],
-)
-def test_an_ending_has_its_exit_code(ending: Ending, code: int) -> None:
-    assert TOY.exit_code({"ending": ending}) == code
-
-
-@pytest.mark.parametrize(
     ("codes", "code"), [([], 0), ([0, 0], 0), ([0, 3], 3), ([3, 1, 0], 1), ([2, 3], 3), ([2, 1], 1)]
 )
 def test_of_many_a_fall_decides_before_all_else_then_a_fault(codes: list[int], code: int) -> None:
@@ -274,17 +261,6 @@ def test_the_verbs_help_imports_no_study() -> None:
         "assert not [name for name in sys.modules if name.startswith('tools.lab')]"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-
-
-@pytest.mark.parametrize(("hits", "of"), [(0, 500), (3, 200), (1, 1), (20, 20)])
-def test_wilsons_bounds_solve_his_equation(hits: int, of: int) -> None:
-    """A bound p is as far from what was seen as 1.96 deviations of a share p allow."""
-    for p in wilson(hits, of):
-        share = hits / of
-        assert (share - p) ** 2 == pytest.approx(1.959964**2 * p * (1 - p) / of, abs=1e-12)
-    low, high = wilson(hits, of)
-    assert 0.0 <= low <= hits / of <= high <= 1.0
-    assert low < high
 
 
 def test_another_gain_schedule_is_another_robot(robot: RobotConfig) -> None:
