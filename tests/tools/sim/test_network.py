@@ -66,19 +66,6 @@ def test_what_comes_twice_is_taken_once() -> None:
     assert one.overtaken == 1
 
 
-def test_the_same_seed_does_the_same_and_another_does_not() -> None:
-    def lost(seed: int) -> list[bool]:
-        one = link(seed, loss=0.5)
-        outcome = []
-        for number in range(100):
-            one.put(number, message(number))
-            outcome.append(one.take(number) is None)
-        return outcome
-
-    assert lost(1) == lost(1)
-    assert lost(1) != lost(2)
-
-
 def test_what_is_injected_comes_on_top_of_what_the_link_does_by_itself() -> None:
     one = link(delay_ms=1.0)
     one.direction.begin(1, Impairment(delay_ms=30.0))

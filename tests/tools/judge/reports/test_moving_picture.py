@@ -49,10 +49,3 @@ def test_modules_change_their_colour_from_track_to_hold_when_the_planner_dies(dr
             seen.append({"#{:02x}{:02x}{:02x}".format(*pixel) for pixel in pixels.reshape(-1, 3)})
     assert [MODE_INK[Mode.TRACK] in inks for inks in seen] == [True, False]
     assert [MODE_INK[Mode.HOLD] in inks for inks in seen] == [False, True]
-
-
-def test_a_picture_that_exists_is_not_replaced_unasked(
-    drawn: Path, made: Made, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["log", "export", str(made.path), "--gif", str(drawn)]) == 2
-    assert "exists already" in capsys.readouterr().err

@@ -14,7 +14,6 @@ import pytest
 from shared.bus.messages import JointEvent, Mode
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig
-from shared.links import DIRECTIONS
 from tests.messages import sample
 from tests.tools.lab.studies.sweeps.tables import finished, printed
 from tools.flags import add_flags, read_flags
@@ -157,16 +156,6 @@ def test_the_network_is_good_until_the_scenario_has_begun_and_then_bad_to_its_en
     assert (inject.link, inject.at, inject.duration) == ("all", begins, None)
     assert not inject.ordered, "datagrams: what is late does not hold up the rest"
     assert trial().scenario(robot).inject == ()
-
-
-def test_all_links_take_the_delay_that_was_asked_for(robot: RobotConfig) -> None:
-    fleet = Lockstep(robot, trial(network=Network(30.0, 0.0, 0.0)).scenario(robot))
-    fleet.network.advance(3.0, 10**9)
-    releases = {
-        name: link.direction.passes(10**9, 0)[0] - 10**9
-        for name, link in ((n, fleet.network.links[n]) for n in DIRECTIONS)
-    }
-    assert set(releases.values()) == {30_000_000}
 
 
 def test_a_control_differs_in_what_its_name_states(robot: RobotConfig) -> None:

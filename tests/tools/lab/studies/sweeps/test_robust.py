@@ -17,7 +17,7 @@ from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from tests.messages import filled, sample
 from tests.tools.lab.studies.sweeps.tables import finished, printed
-from tools.lab.studies.sweeps import figures, plants, robust
+from tools.lab.studies.sweeps import figures, robust
 from tools.lab.studies.sweeps.figures import Ending, Observer
 from tools.lab.studies.sweeps.plants import PushRange
 from tools.lab.studies.sweeps.robust import KINDS, draw, row_of, run_trial
@@ -138,11 +138,6 @@ def test_shoved_from_the_side_on_its_way_into_the_crawl_it_stands(
     trial = draw(pushes, 1, number)
     assert trial.kind == "crawl"
     assert run_trial(trial, robot).ending is Ending.STOOD
-
-
-def test_errors_are_reported_as_one_number_each() -> None:
-    errors = plants.errors_of(plants.draw("one"))
-    assert set(errors) == {row.key for row in plants.shipped().error}
 
 
 def test_a_slope_that_is_asked_for_has_its_size_and_any_direction_and_all_else_as_drawn(

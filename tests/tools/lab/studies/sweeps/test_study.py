@@ -18,10 +18,8 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FELL_EXIT_CODE, RunError
 from tests.tools.lab.studies.sweeps.tables import TOY, ToyFlags, rows_of, sleep, square, sweep
 from tests.waiting import comes_true
-from tools import cli
 from tools.lab.studies.sweeps import pool, push, study
 from tools.lab.studies.sweeps.figures import worst
-from tools.lab.studies.sweeps.kill import KillCases
 from tools.verb_table import Verb
 
 KILL = ("kill", "--split", "diagonal")
@@ -203,21 +201,6 @@ def test_the_baseline_falls_and_alone_that_is_exit_code_1_whatever_the_study_say
         assert float(alone[name]) == pytest.approx(float(row[name]), rel=1e-3)
 
 
-def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
-    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A plain average of the legs cannot carry the whole payload."""
-    some = KillCases(robot)
-    seed = next(s for s in range(100) if some.draw(s, 0).payload_kg == 20.4)
-    average = ("--n", 1, "--workers", 1, "--seed", seed, "--jacobian", "average")
-    assert sweep(*KILL, *average, "--out", tmp_path) == 1
-    output = " ".join(capsys.readouterr().out.split())
-    assert "1 falls of 1" in output
-    command = f"xrl study kill --seed {seed} --split diagonal --jacobian average --only 0"
-    assert command in output
-    assert cli.main(command.split()[1:]) == 1
-
-
 def test_the_push_study_is_tabled_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,15 +235,6 @@ def test_a_case_follows_from_seed_and_number_whatever_was_drawn_before(
     (_, case), (again,), (other,) = drawn(3, 5, 17), drawn(3, 17), drawn(4, 17)
     assert again == case
     assert msgspec.structs.replace(other, seed=3) != case
-
-
-def test_the_verbs_help_imports_no_study() -> None:
-    code = (
-        "import sys\nfrom tools import cli\ntry:\n    cli.main(['study', '--help'])\n"
-        "except SystemExit:\n    pass\n"
-        "assert not [name for name in sys.modules if name.startswith('tools.lab')]"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
 def test_another_gain_schedule_is_another_robot(robot: RobotConfig) -> None:
