@@ -93,8 +93,7 @@ def test_a_slow_line_counts_the_bytes_of_a_message() -> None:
 
 
 @pytest.mark.parametrize(
-    "then",
-    [None, Impairment(delay_ms=1.0), Impairment(delay_ms=9.0, jitter_ms=9.0, duplicate=1.0)],
+    "then", [None, Impairment(delay_ms=1.0), Impairment(delay_ms=9.0, jitter_ms=9.0, duplicate=1.0)]
 )
 def test_a_stream_stays_in_order_when_its_delay_ends_or_changes(then: Impairment | None) -> None:
     one = link()
@@ -189,8 +188,7 @@ def network(*injects: Inject) -> tuple[VirtualNetwork, list[LinkEvent]]:
 
 def test_an_impairment_that_lasts_to_the_end_of_a_run_reports_its_counts_then() -> None:
     made, told = network(
-        Inject(link="harness->planner", at=0.0, loss=1.0),
-        Inject(link="all", at=9.0, loss=1.0),
+        Inject(link="harness->planner", at=0.0, loss=1.0), Inject(link="all", at=9.0, loss=1.0)
     )
     made.advance(0.0, 0)
     for number in range(5):

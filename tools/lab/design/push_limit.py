@@ -41,11 +41,7 @@ optimize, transform = late("scipy.optimize"), late("scipy.spatial.transform")
 
 FRICTION: Final = 0.5
 """Friction coefficient of the soles on a slippery floor."""
-DIRECTIONS: Final = {
-    "forwards": (1.0, 0.0),
-    "back": (-1.0, 0.0),
-    "sideways": (0.0, 1.0),
-}
+DIRECTIONS: Final = {"forwards": (1.0, 0.0), "back": (-1.0, 0.0), "sideways": (0.0, 1.0)}
 """World x and y of each push. Left and right are symmetric."""
 RIGID: Final = 1e9
 """N/m; an integral leaves no error."""
@@ -182,11 +178,7 @@ class LoadedStand:
         return self._hardest(response, np.zeros(2 * N_JOINTS))
 
     def limit_led(
-        self,
-        D: Array,
-        direction: tuple[float, float],
-        K_c: Array,
-        integral_max: float,
+        self, D: Array, direction: tuple[float, float], K_c: Array, integral_max: float
     ) -> PushLimit:
         """Return the hardest push that gains and integral hold, which grew slowly.
 

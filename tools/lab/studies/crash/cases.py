@@ -280,10 +280,7 @@ CASES: Final[Sequence[CrashCase]] = (
     _pair("planner-harness", *killed("planner", "harness"), why=_NEITHER),
     _pair("planner-recorder", *killed("planner", "recorder"), why=_NEITHER),
     _pair(
-        "harness-recorder",
-        *killed("harness", "recorder"),
-        why="balance needs neither",
-        holds=False,
+        "harness-recorder", *killed("harness", "recorder"), why="balance needs neither", holds=False
     ),
     _pair("stopped-planner-knee", *killed("planner", signal="STOP"), *killed("knee_left")),
     _pair("knee-unplugged-hip", *killed("knee_left"), fault("hip_right", "link_lost")),

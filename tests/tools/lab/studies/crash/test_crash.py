@@ -146,11 +146,7 @@ def test_a_disturbed_run_is_made_once_more(
     late = msgspec.structs.replace(STOOD, in_real_time=False)
     for first in (late, LOST):
         done, _ = run_with([first, STOOD], tmp_path, monkeypatch, robot)
-        assert (done.verdict, done.in_real_time, done.tries) == (
-            CrashVerdict.STOOD,
-            True,
-            2,
-        )
+        assert (done.verdict, done.in_real_time, done.tries) == (CrashVerdict.STOOD, True, 2)
     done, _ = run_with([late, late, STOOD], tmp_path, monkeypatch, robot)
     assert (done.in_real_time, done.tries) == (False, 2)
 

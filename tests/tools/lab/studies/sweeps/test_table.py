@@ -32,9 +32,7 @@ DRAWN: Sequence[Mapping[str, object]] = [{"number": n, "drawn": n / 2} for n in 
 
 
 def table_in(
-    folder: Path,
-    drawn: Sequence[Mapping[str, object]] = DRAWN,
-    inputs: Mapping[str, str] = INPUTS,
+    folder: Path, drawn: Sequence[Mapping[str, object]] = DRAWN, inputs: Mapping[str, str] = INPUTS
 ) -> CaseTable:
     return CaseTable(folder / "t.csv", drawn, Figures, inputs)
 
