@@ -78,6 +78,7 @@ PUSH_SHARE: Final = (0.1, 1.0)
 """Shares of the hardest push that is drawn (`PushRange`)."""
 PUSH_S: Final = 0.3
 PUSHES_MAX: Final = 3
+PUSH_COLUMNS: Final = ("at_s", "x_n", "y_n")
 POSES_MAX: Final = 2
 AFTER_KILL_S: Final = 3.0
 AFTER_PUSH_S: Final = 1.7
@@ -87,22 +88,14 @@ operator who leads on against a robot that holds tips it slowly."""
 DELAY_MAX_MS: Final = 20.0
 
 
-class LeadPose(msgspec.Struct, frozen=True):
-    """Where the operator leads."""
-
-    height_m: float
-    pitch_rad: float
-    assist_n: float
-
-
 class KillCase(msgspec.Struct, frozen=True, kw_only=True):
     """A drawn case. SI units; times are the scenario's."""
 
     number: int
     seed: int
     payload_kg: float
-    poses: tuple[LeadPose, ...]
-    """One or two, led to one after the other from standing."""
+    way: tuple[Keyframe, ...]
+    """Standing, then one or two poses that the operator leads to."""
     pace: float
     moving: bool
     """True: killed on the way to the last pose; False: after it has been reached."""
@@ -122,18 +115,13 @@ class KillCase(msgspec.Struct, frozen=True, kw_only=True):
             quiet.append(self.way_end_s + AFTER_LEAD_S)
         return max([self.kill_s + AFTER_KILL_S, *quiet])
 
-    def scenario(self, robot: RobotConfig) -> Scenario:
+    def scenario(self, _robot: RobotConfig) -> Scenario:
         """Return the case as a scenario; the hand that lets go is not in it."""
-        frames = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
-        for pose, (_, end) in zip(self.poses, _legs(robot, self.poses, self.pace), strict=True):
-            frames.append(
-                Keyframe(at=end, height=pose.height_m, pitch=pose.pitch_rad, assist=pose.assist_n)
-            )
         return Scenario(
             name=f"kill-{self.seed}-{self.number}",
             about=f"case {self.number} of `xrl study kill --seed {self.seed}`",
             duration=self.end_s,
-            keyframe=tuple(frames),
+            keyframe=self.way,
             kill=(Kill(service="planner", at=self.kill_s),),
             push=self.pushes,
         )
@@ -168,9 +156,10 @@ class KillCases:
         dice = random.Random(f"kill {seed} {number}")
         payload = dice.choice(payloads(self._robot))
         loaded, pushes = self._of(payload)
-        poses = tuple(_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX))))
+        poses = [_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX)))]
         pace = uniform(dice, *PACE)
-        begin, end = _legs(self._robot, poses, pace)[-1]
+        way = _way(self._robot, poses, pace)
+        begin, end = way[-2].at, way[-1].at
         moving = dice.random() < 0.5
         kill = uniform(dice, *((begin, end) if moving else (end + STILL_S[0], end + STILL_S[1])))
         hand_off = dice.random() < 0.5
@@ -182,7 +171,7 @@ class KillCases:
             number=number,
             seed=seed,
             payload_kg=payload,
-            poses=poses,
+            way=way,
             pace=pace,
             moving=moving,
             way_end_s=end,
@@ -199,8 +188,8 @@ class KillCases:
         return self._by_payload[payload]
 
 
-def _draw_pose(dice: random.Random, robot: RobotConfig) -> LeadPose:
-    """Draw a posture that the legs reach, and the weight rested on it in half of the cases."""
+def _draw_pose(dice: random.Random, robot: RobotConfig) -> tuple[float, float, float]:
+    """Draw height, pitch that the legs reach, and the weight rested on them in half of the cases."""
     while True:
         upright = dice.random() < 0.5
         height = uniform(dice, *(HEIGHT_UPRIGHT if upright else HEIGHT))
@@ -208,7 +197,7 @@ def _draw_pose(dice: random.Random, robot: RobotConfig) -> LeadPose:
         if reachable(robot, height, pitch):
             break
     resting = dice.random() < 0.5
-    return LeadPose(height, pitch, uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0)
+    return height, pitch, uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0
 
 
 def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> list[Push]:
@@ -238,32 +227,33 @@ def reachable(robot: RobotConfig, height: float, pitch: float) -> bool:
     )
 
 
-def _legs(
-    robot: RobotConfig, poses: tuple[LeadPose, ...], pace: float
-) -> list[tuple[float, float]]:
-    """Return when the way to each pose begins and ends, s."""
-    legs, t = [], START_S
-    before = LeadPose(robot.simulation.stand_height, 0.0, 0.0)
+def _way(
+    robot: RobotConfig, poses: Sequence[tuple[float, float, float]], pace: float
+) -> tuple[Keyframe, ...]:
+    """Return the way from standing to each pose of height, pitch and assist."""
+    way = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
     for pose in poses:
-        ways = zip(msgspec.structs.astuple(before), msgspec.structs.astuple(pose), strict=True)
-        times = [abs(b - a) / speed for (a, b), speed in zip(ways, SPEED, strict=True)]
-        legs.append((t, round(t + max(LEG_MIN_S, max(times) / pace), DIGITS)))
-        before, t = pose, legs[-1][1]
-    return legs
+        last = way[-1]
+        before = last.height, last.pitch, last.assist
+        times = [abs(b - a) / speed for a, b, speed in zip(before, pose, SPEED, strict=True)]
+        at = round(last.at + max(LEG_MIN_S, max(times) / pace), DIGITS)
+        way.append(Keyframe(at, pose[0], pitch=pose[1], assist=pose[2]))
+    return tuple(way)
 
 
 def row_of(case: KillCase) -> dict[str, object]:
     """Return every draw by its column; None where there was no such draw."""
     row = scalars(case) | {"moving": int(case.moving)}
-    for index in range(POSES_MAX):
-        pose = case.poses[index] if index < len(case.poses) else None
-        for key in LeadPose.__struct_fields__:
-            row[f"pose{index + 1}_{key}"] = getattr(pose, key, None)
+    units = {"height": "m", "pitch": "rad", "assist": "n"}
+    for index in range(1, POSES_MAX + 1):
+        pose = case.way[index] if index < len(case.way) else None
+        row |= {f"pose{index}_{key}_{unit}": getattr(pose, key, None)
+                for key, unit in units.items()}  # fmt: skip
     for index in range(PUSHES_MAX):
         push = case.pushes[index] if index < len(case.pushes) else None
-        row[f"push{index + 1}_at_s"] = push.at if push else None
-        row[f"push{index + 1}_x_n"] = push.force[0] if push else None
-        row[f"push{index + 1}_y_n"] = push.force[1] if push else None
+        values = (push.at, *push.force[:2]) if push else (None,) * 3
+        names = (f"push{index + 1}_{name}" for name in PUSH_COLUMNS)
+        row |= dict(zip(names, values, strict=True))
     return row
 
 
@@ -470,8 +460,7 @@ def describe(row: Row) -> str:
 
 def _pushes(row: Row) -> list[tuple[float, float, float]]:
     """Return time, x and y of each push of a row."""
-    columns = ("at_s", "x_n", "y_n")
-    found = [[row[f"push{i}_{name}"] for name in columns] for i in range(1, PUSHES_MAX + 1)]
+    found = [[row[f"push{i}_{name}"] for name in PUSH_COLUMNS] for i in range(1, PUSHES_MAX + 1)]
     return [(at, x, y) for at, x, y in found if at is not None]
 
 

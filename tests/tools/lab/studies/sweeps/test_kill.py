@@ -73,7 +73,7 @@ def test_no_draw_is_beyond_the_study(robot: RobotConfig, drawn: list[KillCase]) 
         assert case.end_s >= case.kill_s + 2.999
         assert case.end_s >= case.pushes[-1].at + 1.99
         assert case.let_go_s is not None or case.end_s >= case.way_end_s + 1.99
-        assert all(0.0 <= pose.assist_n <= robot.assist.force_max for pose in case.poses)
+        assert all(0.0 <= pose.assist <= robot.assist.force_max for pose in case.way)
 
 
 def test_every_kind_of_case_is_drawn(drawn: list[KillCase]) -> None:
@@ -83,13 +83,11 @@ def test_every_kind_of_case_is_drawn(drawn: list[KillCase]) -> None:
         "hand off at the kill": sum(case.let_go_s == case.kill_s for case in drawn),
         "pushed before the kill": sum(case.pushes[0].at < case.kill_s for case in drawn),
         "three pushes": sum(len(case.pushes) == 3 for case in drawn),
-        "two poses": sum(len(case.poses) == 2 for case in drawn),
-        "upright": sum(case.poses[-1].pitch_rad == 0.0 for case in drawn),
-        "crawling": sum(
-            case.poses[-1].height_m < 0.9 and case.poses[-1].pitch_rad > 0.6 for case in drawn
-        ),
-        "assist": sum(case.poses[-1].assist_n > 50.0 for case in drawn),
-        "no assist": sum(case.poses[-1].assist_n == 0.0 for case in drawn),
+        "two poses": sum(len(case.way) == 3 for case in drawn),
+        "upright": sum(case.way[-1].pitch == 0.0 for case in drawn),
+        "crawling": sum(case.way[-1].height < 0.9 and case.way[-1].pitch > 0.6 for case in drawn),
+        "assist": sum(case.way[-1].assist > 50.0 for case in drawn),
+        "no assist": sum(case.way[-1].assist == 0.0 for case in drawn),
     }
     assert min(share.values()) >= 0.05 * DRAWN, share
     quadrants = {
@@ -106,9 +104,9 @@ def test_a_case_is_a_scenario(robot: RobotConfig, drawn: list[KillCase]) -> None
         there = scenario.keyframe[-1].at
         assert (case.kill_s < there) if case.moving else (case.kill_s >= there + 0.3)
         assert scenario.push == case.pushes
-        for pose, frame in zip(case.poses, scenario.keyframe[1:], strict=True):
-            led = lead(scenario, frame.at)
-            assert (led.height, led.pitch, led.assist) == msgspec.structs.astuple(pose)
+        for pose in case.way:
+            led = lead(scenario, pose.at)
+            assert (led.height, led.pitch, led.assist) == (pose.height, pose.pitch, pose.assist)
 
 
 @pytest.mark.parametrize(("height", "pitch"), [(0.79, 1.2), (0.85, 0.0), (1.2, 0.6)])
