@@ -189,7 +189,7 @@ class KillCases:
 
 
 def _draw_pose(dice: random.Random, robot: RobotConfig) -> tuple[float, float, float]:
-    """Draw height, pitch that the legs reach, and the weight rested on them in half of the cases."""
+    """Draw height and pitch that the legs reach, and in half of the cases a weight on them."""
     while True:
         upright = dice.random() < 0.5
         height = uniform(dice, *(HEIGHT_UPRIGHT if upright else HEIGHT))
