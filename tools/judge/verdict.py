@@ -192,10 +192,8 @@ def course(log: RunLog) -> Course:
 def summarise(log: RunLog, duration_s: float, counts: dict[str, KeyCount] | None = None) -> Summary:
     """Return the figures of a run, or of a part of one; what follows a fall does not count.
 
-    Args:
-        log: the run, or the part.
-        duration_s: planned length of its scenario.
-        counts: of the messages up to the end of the part; None: the log is the whole run.
+    `duration_s` is the planned length of its scenario; `counts` are of the messages up to the end
+    of the part; None: the log is the whole run.
     """
     t, truth, began, zero_ns = course(log)
     counted = (log.gaps() if counts is None else counts).values()

@@ -360,10 +360,8 @@ def begin_standing(fleet: Lockstep) -> bool:
     To stand up takes 3.6 s of each run. Where many runs of one robot on one plant follow each
     other, it is stood up once in each process, and each run continues from there. Standing up
     itself is tested by `tests/lockstep/test_dead_services.py` and by the sweeps over drawn plants:
-    they begin on the hoist.
-
-    Returns:
-        False if this robot is never led on this plant: it then begins on the hoist.
+    they begin on the hoist. Returns False if this robot is never led on this plant: it then begins
+    on the hoist.
     """
     start = standing(fleet.config, fleet.plant)
     if start is not None:
@@ -372,12 +370,7 @@ def begin_standing(fleet: Lockstep) -> bool:
 
 
 def standing(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
-    """Return the moment at which a scenario begins; None if it never does.
-
-    Args:
-        robot: ready to run.
-        plant: the true robot; the network is `BASE`.
-    """
+    """Return the moment at which a scenario begins over `BASE`; None if it never does."""
     schedule = robot.gain_schedule
     key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
     if key not in _known:

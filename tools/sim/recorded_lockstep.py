@@ -75,15 +75,9 @@ def record_run(
 ) -> Outcome:
     """Record one run into `run.mcap` with its inputs beside it, and return what `run` returned.
 
-    Args:
-        scenario: what happens.
-        robot: ready to run.
-        out: an empty folder.
-        metadata: added to the log's facts, at least `lockstep` with the command or the network.
-        run: runs it, given the function that records a message and the one that sees the world.
-        watch: sees the world at its rate.
-        true_plant: that `run` simulates.
-        attached: names and files that go into the log as well.
+    `run` gets the function that records a message and the one that sees the world, and simulates
+    `true_plant`. `metadata` is added to the log's facts, at least `lockstep` with the command or
+    the network. The files `attached` go into the log as well.
 
     Raises:
         RunError: the log cannot be written.
@@ -135,20 +129,10 @@ def simulate(
 ) -> float:
     """Record a run of the fleet in virtual time, to its end or a second past a fall.
 
-    Args:
-        robot: ready to run.
-        scenario: what happens.
-        network: of every link, beside the scenario's own impairments.
-        seed: of the sensors' noise and of the network.
-        out: an empty folder.
-        watch: sees the world at its rate.
-        control: a name of `CONTROLS`.
-        true_plant: the simulated robot; None: the robot file's.
-        hand: how somebody leads the hand in place of the scenario.
-        controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
-
-    Returns:
-        The simulated time, s.
+    Returns the simulated time, s. `network` comes on every link, beside the scenario's own
+    impairments; `seed` is of the sensors' noise and of the network. `control` is a name of
+    `CONTROLS`; `hand` leads in place of the scenario; `controller` is somebody's own,
+    `FILE.py[:NAME]`, in the place of the law.
 
     Raises:
         RunError: the log cannot be written.

@@ -48,12 +48,7 @@ class HostClock:
     """
 
     def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
-        """Begin.
-
-        Args:
-            offset_ns: ahead of virtual time at its zero.
-            drift_ppm: so much too fast, in millionths.
-        """
+        """Begin ahead of virtual time, and gain by `drift_ppm` millionths."""
         self.offset_ns = offset_ns
         self.drift_ppm = drift_ppm
 

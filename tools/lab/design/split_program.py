@@ -95,12 +95,8 @@ def solve(
 ) -> GainSchedule:
     """Return the schedule of a robot.
 
-    Args:
-        config: the robot.
-        progress: called with the poses done and their total.
-        report: called with text on the search for damping.
-        design: damping and coupling to use; None to search for them.
-        check: check a given design against the dynamic certificate.
+    A given design is used, and with `check` checked against the dynamic certificate; without one
+    it is searched for.
 
     Raises:
         RunError: at a pose no local gains meet the certificate; names the pose.

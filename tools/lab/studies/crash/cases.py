@@ -204,16 +204,13 @@ def _lost(service: str, signal: str) -> CrashCase:
     )
 
 
-def _is_overspeed_after_a_gap(module: str) -> bool:
-    """Return True for a knee: it moves on the way down, and its count jumps at the gap's end."""
-    return kind_of(module) == "knee"
-
-
 def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCase:
     """Return the case of one drive's fault."""
     name: str = kind
     expected = CrashVerdict.STOOD
-    if kind == "encoder_gap" and not _is_overspeed_after_a_gap(module):
+    # a knee moves on the way down: its count jumps at the gap's end, which is an overspeed
+    hardly_moves = kind == "encoder_gap" and kind_of(module) != "knee"
+    if hardly_moves:
         why = "the joint hardly moves meanwhile: the drive holds through it"
     elif not DRIVE_FAULTS[kind].limp and kind != "encoder_gap":
         name = "unplugged" if kind == "link_lost" else kind
@@ -227,7 +224,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCa
         crash=(fault(module, kind),),
         expected=expected,
         why=why,
-        holds=kind != "bus_full" and (kind != "encoder_gap" or _is_overspeed_after_a_gap(module)),
+        holds=kind != "bus_full" and not hardly_moves,
         leads_again=not DRIVE_FAULTS[kind].zero_lost,
         quick=quick,
     )

@@ -169,11 +169,8 @@ def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> Cra
     if not in_real_time:
         remarks.append("not in real time: the machine was too slow")
     tracks = [event.t_ns for event in later if event.mode_after == Mode.TRACK]
-    backs = [
-        row.t_ns
-        for row in messages.actions
-        if row.kind == RunEventKind.RESTARTED and row.scenario_s >= REQUEST_S
-    ]
+    restarts = [row for row in messages.actions if row.kind == RunEventKind.RESTARTED]
+    backs = [row.t_ns for row in restarts if row.scenario_s >= REQUEST_S]
     x, y = ([1e3 * row.over[axis] for row in standing] for axis in (0, 1))
     return CrashResult(
         verdict=verdict,
@@ -193,11 +190,9 @@ def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> Cra
 
 def _crash_s(case: CrashCase, actions: Sequence[RunEvent]) -> float | None:
     """Return the scenario time of the crash, s: of the triggered kill, if there is one."""
-    kills = [
-        row.scenario_s
-        for row in actions
-        if row.kind == RunEventKind.KILLED and row.scenario_s < REQUEST_S - END_TOLERANCE_S
-    ]
+    until_s = REQUEST_S - END_TOLERANCE_S
+    kills = [row.scenario_s for row in actions if row.kind == RunEventKind.KILLED]
+    kills = [at_s for at_s in kills if at_s < until_s]
     if case.triggered_kill is not None:
         led_up = sum(1 for row in scenario_of(case).kill if row.at < CRASH_S)
         return kills[led_up] if len(kills) > led_up else None
@@ -224,16 +219,17 @@ def _remarks(
     case: CrashCase, safe_ms: float | None, reaction: Sequence[tuple[str, JointEvent]]
 ) -> list[str]:
     """Return the unexpected changes of mode of modules that were not hit, as text."""
+    others = [(name, event) for name, event in reaction if name in case.others]
+    changed = sorted({name for name, _ in others})
     words = []
-    changed = sorted({name for name, _ in reaction if name in case.others})
     if case.holds and case.others and safe_ms is None:
         words.append("not all of the other modules held")
     if not case.holds and changed:
         words.append(f"left TRACK: {', '.join(changed)}")
     words += [
         f"{name} went to {Mode(event.mode_after).name}"
-        for name, event in reaction
-        if name in case.others and event.mode_after in UNSAFE
+        for name, event in others
+        if event.mode_after in UNSAFE
     ]
     words += [
         f"{name} tripped: {Cause(event.cause).name}"
@@ -241,34 +237,6 @@ def _remarks(
         if event.cause in JOINT_TRIPS
     ]
     return words
-
-
-class Witness:
-    """Keeps the bus messages that the verdict needs, beside the recorder."""
-
-    def __init__(self, session: Session, show: Show) -> None:
-        self.truth: list[SimTruth] = []
-        self.events: list[tuple[str, JointEvent]] = []
-        self.modes: tuple[str, ...] = ("-",) * len(MODULES)
-        self._modules = {topics.JOINT_EVENT.key(session.robot, name): name for name in MODULES}
-        self._stream = session.stream([topics.JOINT_EVENT.key(session.robot, "*")])
-        self._decoder = Decoder(JointEvent)
-        self._show = show
-
-    def see(self, snapshot: LiveSnapshot) -> None:
-        """Take in a moment of the run, and pass it on."""
-        if snapshot.truth is not None:
-            self.truth.append(snapshot.truth)
-        self.modes = snapshot.modes
-        self.listen()
-        self._show(snapshot)
-
-    def listen(self) -> None:
-        """Take in the changes of mode that have come."""
-        while (sample := self._stream.take()) is not None:
-            event = self._decoder.decode(sample[1])
-            if event is not None:
-                self.events.append((self._modules[sample[0]], event))
 
 
 def run_case(
@@ -302,12 +270,30 @@ def _run_once(case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: 
     down = {row.service for row in scenario.kill}
 
     def conduct(fleet: SupervisedFleet, session: Session) -> CrashMessages:
-        witness = Witness(session, show)
-        conductor = ScenarioRunner(fleet, session, scenario, witness.see, case.triggered_kill)
+        modules = {topics.JOINT_EVENT.key(session.robot, name): name for name in MODULES}
+        stream = session.stream([topics.JOINT_EVENT.key(session.robot, "*")])
+        decoder, modes = Decoder(JointEvent), ["-"] * len(MODULES)
+        truth, events = list[SimTruth](), list[tuple[str, JointEvent]]()
+
+        def listen() -> None:
+            while (sample := stream.take()) is not None:
+                event = decoder.decode(sample[1])
+                if event is not None:
+                    events.append((modules[sample[0]], event))
+
+        def see(snapshot: LiveSnapshot) -> None:
+            if snapshot.truth is not None:
+                truth.append(snapshot.truth)
+            modes[:] = snapshot.modes
+            listen()
+            show(snapshot)
+
+        conductor = ScenarioRunner(fleet, session, scenario, see, case.triggered_kill)
         conductor.run()
-        witness.listen()
-        died = died_of(fleet.info(), conductor.said)
-        return CrashMessages(witness.truth, witness.events, conductor.said, witness.modes, died)
+        listen()
+        return CrashMessages(
+            truth, events, conductor.said, modes, died_of(fleet.info(), conductor.said)
+        )
 
     try:
         run = run_live(

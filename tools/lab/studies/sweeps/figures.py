@@ -39,12 +39,7 @@ class Observer(NamedTuple):
     """How long the trial continues after a fall, at which measurement ends."""
 
     def rows_that_count(self, run: Iterable[SimTruth], from_s: float) -> Iterator[SimTruth]:
-        """Run to the end or to the fall; yield what counts of it, a fall included.
-
-        Args:
-            run: the world, as a fleet in virtual time gives it.
-            from_s: scenario time from which on a row counts, s.
-        """
+        """Run to the end or to the fall; yield the rows from a scenario time on, and a fall."""
         fell_at_s: float | None = None
         for row in run:
             self.watch(row)
@@ -110,16 +105,9 @@ def run_fleet(
 ) -> CaseRun:
     """Run a case in virtual time to its end or to the fall.
 
-    Args:
-        case: what happens, and on which plant.
-        robot: as its controllers know it.
-        observer: sees the run.
-        network: of every link, beside the scenario's own impairments.
-        seed: of the network and of the sensors' noise.
-        from_s: scenario time from which on a row counts, s.
-        kept: kinds of messages to keep.
-        fleet_type: its class.
-        each: called with every row, before the observer.
+    Rows count from the scenario time `from_s` on. The network is that of every link, beside the
+    scenario's own impairments. Messages of the kinds `kept` are kept. `each` is called with every
+    row, before the observer.
     """
     messages: list[tuple[str, Message]] = []
 
@@ -222,11 +210,8 @@ def event_steps_nm(events: Iterable[JointEvent]) -> list[float]:
 def wilson(hits: int, of: int) -> tuple[float, float]:
     """Return the 95 % interval of a share that was seen in some trials (E. B. Wilson, 1927).
 
-    It holds for one share: of several intervals, the worst is missed more often than once in 20.
-
-    Args:
-        hits: how often it was so.
-        of: trials, independent of each other; at least 1.
+    The trials are independent of each other. It holds for one share: of several intervals, the
+    worst is missed more often than once in 20.
     """
     interval = stats.binomtest(hits, of).proportion_ci(method="wilson")
     return float(interval.low), float(interval.high)

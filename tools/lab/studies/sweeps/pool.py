@@ -72,14 +72,9 @@ def results(
 ) -> Iterator[tuple[T, R]]:
     """Yield each task with its result as it is done, in no order.
 
-    Leaving the loop early, by an exception or by `close`, ends the rest at once.
-
-    Args:
-        work: a function of a module; it runs in the workers.
-        tasks: its arguments, one after the other.
-        workers: processes of this machine; 1: this process.
-        name: returns a task's name for an error.
-        cluster: address of a Dask scheduler, whose workers then run the tasks.
+    Leaving the loop early, by an exception or by `close`, ends the rest at once. `work` is a
+    function of a module, `name` returns a task's name for an error. One worker is this process.
+    With the address of a Dask scheduler its workers run the tasks.
 
     Raises:
         RunError: no worker can be started or reached, the work failed on a task, a worker died, or

@@ -292,10 +292,8 @@ def show_outcome(
 ) -> None:
     """Print the falls, the median and the worst figures of the others, and the share of falls.
 
-    Args:
-        finished: the study.
-        figures: column, words, unit, and the sign that is worse.
-        describe: returns a case in a line.
+    `figures` are column, words, unit, and the sign that is worse; `describe` returns a case in a
+    line.
     """
     rows, console, command = finished.rows, finished.console, finished.command
     standing, fallen = parted(rows)

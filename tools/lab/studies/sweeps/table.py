@@ -41,11 +41,8 @@ class CaseTable:
     ) -> None:
         """Open a table, new or to resume; incomplete or damaged rows are left out.
 
-        Args:
-            path: of the CSV file; its folder is made if it is missing.
-            drawn: by case, the start of its row; the first column is the case's number.
-            figures: the rest of a row.
-            inputs: parameters of the rows, by name.
+        A row begins with what was drawn for its case, the case's number first, and ends with its
+        figures. `inputs` are parameters of all rows, by name.
 
         Raises:
             RunError: the folder cannot be used, another study is writing to it, or its parameters
