@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.joint.differential import motor_torque
-from services.joint.heat import HeatEstimate
+from services.joint.heat import HeatEstimate, report
 from services.planner.law.kinematics import Kinematics
 from shared.bus.messages import LEFT_MAX_S, HeatAction, Mode, PlannerMode
 from shared.bus.traces import SimTruth
@@ -33,6 +33,15 @@ class Held(NamedTuple):
     derating: float
 
 
+def skip_heat(fleet: Lockstep, seconds: float = 1.0) -> None:
+    """Let time pass for the temperatures alone, true and estimated: their constants are minutes."""
+    fleet.bank.heat.skip(fleet.bank.heat.load, seconds)
+    for joint in fleet.joints:
+        state = joint.manager.state.controller.heat
+        joint.manager.controller.heat.skip(state, seconds)
+        report(state, *joint.drive.thermistors())
+
+
 def hold(
     robot: RobotConfig, start: FleetMoment, *, hand: bool = True, until_s: float = 16.0,
     skip: bool = True,
@@ -48,7 +57,7 @@ def hold(
         if skips and row.scenario_s > HELD_S:
             skips = False
             while min(law.heat.left_s for law in fleet.controllers) > 33.0:
-                fleet.skip_heat(1.0)
+                skip_heat(fleet)
         actions.append(status_of(fleet).heat)
         derating = min(derating, fleet.bank.heat.derating)
     return Held(fleet, rows, actions, derating)

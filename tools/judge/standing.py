@@ -90,11 +90,6 @@ def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
     return ""
 
 
-def is_tipping(row: SimTruth, robot: RobotConfig) -> bool:
-    """Return True if the robot does not stand, or cannot recover."""
-    return bool(why_not_standing(row, robot))
-
-
 BREAK_S: Final = 0.05
 """Longest gap between states; within a longer one nothing is known."""
 SINK_OVER_S: Final = 0.1

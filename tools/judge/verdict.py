@@ -49,20 +49,6 @@ class Percentiles(msgspec.Struct, frozen=True):
     p99: float
 
 
-class ShownImpairment(msgspec.Struct, frozen=True):
-    """One impairment of the network; times in scenario time."""
-
-    link: str
-    words: str
-    """The impairment, as `--inject` takes it."""
-    begin_s: float
-    end_s: float | None
-    passed: int | None
-    lost: int | None
-    said: str
-    """All of it as a line for people."""
-
-
 class ShownStall(msgspec.Struct, frozen=True):
     """One stall of the machine; times in scenario time."""
 
@@ -154,7 +140,8 @@ class Summary(msgspec.Struct, kw_only=True):
     command_age_impaired_ms: Spread = None
     command_age_otherwise_ms: Spread = None
     links_impaired: int = 0
-    impairments: list[ShownImpairment] = []
+    impairments: list[str] = []
+    """Where, what, when, messages passed and lost; a line for each."""
     pd_cycles_late_pct: Largest = None
     planner_tick_us: Spread = None
     stopped: list[str] = []
@@ -205,10 +192,8 @@ def course(log: RunLog) -> Course:
 def summarise(log: RunLog, duration_s: float, counts: dict[str, KeyCount] | None = None) -> Summary:
     """Return the figures of a run, or of a part of one; what follows a fall does not count.
 
-    Args:
-        log: the run, or the part.
-        duration_s: planned length of its scenario.
-        counts: of the messages up to the end of the part; None: the log is the whole run.
+    `duration_s` is the planned length of its scenario; `counts` are of the messages up to the end
+    of the part; None: the log is the whole run.
     """
     t, truth, began, zero_ns = course(log)
     counted = (log.gaps() if counts is None else counts).values()
@@ -440,17 +425,9 @@ def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     return led & tracking(log, times_ns)
 
 
-def shown(row: Impaired, zero_ns: int) -> ShownImpairment:
-    """Return an impairment as the summary has it; times in s after a stamp."""
-    return ShownImpairment(
-        link=row.link,
-        words=row.words,
-        begin_s=row.begin_s(zero_ns),
-        end_s=row.end_s(zero_ns),
-        passed=row.passed,
-        lost=row.lost,
-        said=f"{row.title}: {row.when(zero_ns)}; {row.counts()}",
-    )
+def shown(row: Impaired, zero_ns: int) -> str:
+    """Return an impairment in a line; times in s after a stamp."""
+    return f"{row.title}: {row.when(zero_ns)}; {row.counts()}"
 
 
 def _add_command_ages(

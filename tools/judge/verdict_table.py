@@ -109,7 +109,7 @@ def network(summary: Summary) -> list[str]:
 
     If there is any, one more line compares the commands' ages during impairments and outside.
     """
-    lines = [row.said for row in summary.impairments]
+    lines = list(summary.impairments)
     ages = [
         f"{digits(age.median)} ms, 99 % within {digits(age.p99)} ms {when}"
         for when, age in (

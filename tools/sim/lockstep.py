@@ -15,7 +15,6 @@ import msgspec
 
 from services.joint.controller import ControllerState
 from services.joint.drive_manager import DriveManager, DriveManagerState
-from services.joint.heat import report
 from services.planner.controller import Controller
 from services.planner.intents import OperatorRequest
 from services.planner.planner import Planner, PlannerState
@@ -140,7 +139,7 @@ class Lockstep:
         self.plant = plant or PlantConfig()
         self.events: list[tuple[str, JointEvent]] = []
         self.time = time = VirtualTime(NS_PER_S)
-        self._record, self._traced, self._controller = record, traced, controller
+        self._record, self._traced = record, traced
         self.network = network_ = VirtualNetwork(
             network or BASE,
             scenario.inject,
@@ -162,8 +161,18 @@ class Lockstep:
             config, robot, frames, network_, record, time=time, clock=clock_of["imu"]
         )
         self._memory = SharedMemory()
+
+        def new_planner(session: int) -> Planner:
+            if controller is None:
+                return self.planner_type(config, session)
+            return Planner(config, session, controller())
+
+        def request() -> OperatorRequest:
+            wanted = robot.world.lead()
+            return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
+
         self._planner = VirtualPlanner(
-            config, self._new_planner, self._request, network_, record,
+            config, new_planner, request, network_, record,
             time=time, clock=clock_of["planner"], traced=traced,
             beside=self._memory if planner_beside else None,
         )  # fmt: skip
@@ -265,7 +274,9 @@ class Lockstep:
             for bus in self.buses.values():
                 bus.advance(now)
             robot.step_drives()
-            self._cycle_joints()
+            for joint in self.joints:
+                if not joint.frozen and (event := joint.cycle().event) is not None:
+                    self.events.append((joint.name, event))
         elif self.bank.regulates:
             robot.step_drives()
         self.harness.advance()
@@ -275,43 +286,12 @@ class Lockstep:
         robot.step_world()
         self.time.now_ns += robot.every.step
 
-    def _new_planner(self, session: int) -> Planner:
-        if self._controller is None:
-            return self.planner_type(self.config, session)
-        return Planner(self.config, session, self._controller())
-
-    def _request(self) -> OperatorRequest:
-        wanted = self.world.lead()
-        return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
-
-    def _cycle_joints(self) -> None:
-        for joint in self.joints:
-            if not joint.frozen:
-                event = joint.cycle().event
-                if event is not None:
-                    self.events.append((joint.name, event))
-
     def lead(self, hand: HandLead) -> None:
         """Let somebody lead the hand in place of the scenario, and record it."""
         self._progress.led += 1
         hand = msgspec.structs.replace(hand, t_ns=self.now_ns, seq=self._progress.led)
         self.world.take_hand(hand)
         self._record(topics.OPERATOR_HAND, "", hand)
-
-    def skip_heat(self, seconds: float) -> None:
-        """Let time pass for the temperatures alone, true and estimated, under the present load.
-
-        For a pose that is held: thermal time constants are minutes.
-        """
-        heat = self.bank.heat
-        while seconds > 0.0:
-            step_s = min(1.0, seconds)
-            heat.skip(heat.load, step_s)
-            for joint in self.joints:
-                estimate, state = joint.manager.controller.heat, joint.manager.state.controller.heat
-                estimate.skip(state, step_s)
-                report(state, *joint.drive.thermistors())
-            seconds -= step_s
 
     def act(self, row: Happening) -> None:
         """Carry out a row of the scenario, or of somebody who looks on, and record it."""
@@ -323,7 +303,9 @@ class Lockstep:
             detail = f"{x:g},{y:g},{z:g} N for {row.duration:g} s"
             self._put_event(RunEventKind.PUSHED, "torso", detail)
             return
-        service = self._planner if row.service == "planner" else self._joint_named(row.service)
+        service = (
+            self._planner if row.service == "planner" else self.joints[MODULE_INDEX[row.service]]
+        )
         if isinstance(row, Kill):
             self._put_event(RunEventKind.KILLED, row.service, row.signal)
             service.kill(for_good=row.signal != "STOP")
@@ -355,9 +337,6 @@ class Lockstep:
         )
         self._record(topics.RUN_EVENT, "", event)
 
-    def _joint_named(self, name: str) -> VirtualJoint:
-        return self.joints[MODULE_INDEX[name]]
-
     @staticmethod
     def _check_kills(config: RobotConfig, scenario: Scenario) -> None:
         killable = ("planner", *(MODULES if config.joint_service.loop == "onboard" else ()))
@@ -381,10 +360,8 @@ def begin_standing(fleet: Lockstep) -> bool:
     To stand up takes 3.6 s of each run. Where many runs of one robot on one plant follow each
     other, it is stood up once in each process, and each run continues from there. Standing up
     itself is tested by `tests/lockstep/test_dead_services.py` and by the sweeps over drawn plants:
-    they begin on the hoist.
-
-    Returns:
-        False if this robot is never led on this plant: it then begins on the hoist.
+    they begin on the hoist. Returns False if this robot is never led on this plant: it then begins
+    on the hoist.
     """
     start = standing(fleet.config, fleet.plant)
     if start is not None:
@@ -393,12 +370,7 @@ def begin_standing(fleet: Lockstep) -> bool:
 
 
 def standing(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
-    """Return the moment at which a scenario begins; None if it never does.
-
-    Args:
-        robot: ready to run.
-        plant: the true robot; the network is `BASE`.
-    """
+    """Return the moment at which a scenario begins over `BASE`; None if it never does."""
     schedule = robot.gain_schedule
     key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
     if key not in _known:

@@ -12,12 +12,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final, Generic, TypeVar
 
 from shared.bus.codec import encode
-from shared.bus.messages import Attitude, JointCommand, JointState, Message, Wrench
+from shared.bus.messages import Message
 from shared.bus.traces import LinkEvent
 from shared.config.impairment import HELD, Direction, Impairer, Impairment
 from shared.config.scenarios import Inject
-from shared.joints import MODULES
-from shared.links import ATTITUDES, DIRECTIONS, WRENCHES
+from shared.links import DIRECTIONS
 from shared.network.impairment_schedule import ImpairmentSchedule
 
 M = TypeVar("M", bound=Message)
@@ -107,7 +106,11 @@ class VirtualLink(Generic[M]):
 
 
 class VirtualNetwork:
-    """Every link, by direction."""
+    """Every link.
+
+    Attributes:
+        links: by direction, as named in `shared.links`.
+    """
 
     def __init__(
         self,
@@ -120,46 +123,23 @@ class VirtualNetwork:
 
         `record` takes an event whenever one of those starts or ends.
         """
-        self._links: dict[str, VirtualLink[Any]] = {
+        self.links: dict[str, VirtualLink[Any]] = {
             name: VirtualLink(base, name, seed) for name in DIRECTIONS
         }
         self._injections = ImpairmentSchedule(
-            {name: link.direction for name, link in self._links.items()}, record
+            {name: link.direction for name, link in self.links.items()}, record
         )
         for inject in sorted(injects, key=lambda inject: inject.at):
             self._injections.plan(inject.link, inject, inject.at, inject.until)
 
-    def commands(self) -> list[VirtualLink[JointCommand]]:
-        """Return the links from the planner, in the order of the modules."""
-        return [self._links[f"planner->{module}"] for module in MODULES]
-
-    def states(self) -> list[VirtualLink[JointState]]:
-        """Return the links to the planner, in the order of the modules."""
-        return [self._links[f"{module}->planner"] for module in MODULES]
-
-    def wrenches(self) -> VirtualLink[Wrench]:
-        """Return the link from the harness to the planner."""
-        return self._links[WRENCHES]
-
-    def attitudes(self) -> VirtualLink[Attitude]:
-        """Return the link from the IMU to the planner."""
-        return self._links[ATTITUDES]
-
     def advance(self, scenario_s: float, now_ns: int) -> None:
         """Start and end what is due, and release the messages held until then."""
         if self._injections.advance(scenario_s, now_ns):
-            for link in self._links.values():
+            for link in self.links.values():
                 link.release(now_ns)
 
     def cut(self, link: str, for_s: float, scenario_s: float, now_ns: int) -> None:
-        """Cut links off now, for a while: somebody who looks on wants it.
-
-        Args:
-            link: of `shared.links`.
-            for_s: how long, s.
-            scenario_s: scenario time.
-            now_ns: virtual time.
-        """
+        """Cut links of `shared.links` off now, for a while: somebody who looks on wants it."""
         self._injections.begin(link, Impairment(partition=True), scenario_s + for_s, now_ns)
 
     def active(self, scenario_s: float) -> tuple[str, ...]:

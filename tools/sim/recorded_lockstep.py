@@ -1,4 +1,4 @@
-"""Runs in virtual time, recorded into `run.mcap` and judged by that log alone."""
+"""Runs in virtual time, recorded into `run.mcap`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,6 @@ from shared.config.scenarios import Scenario
 from shared.mcap_log import provenance
 from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.robot.robot_model import mjcf
-from tools.judge.figure import judge_run
-from tools.judge.verdict import Summary
 from tools.live import experiment
 from tools.logs.hand_path import HandRow
 from tools.sim.centralised import CONTROLS, SHIPPED
@@ -75,20 +73,11 @@ def record_run(
     true_plant: PlantConfig,
     attached: Sequence[tuple[str, Path]] = (),
 ) -> Outcome:
-    """Record one run into `run.mcap` with its inputs beside it.
+    """Record one run into `run.mcap` with its inputs beside it, and return what `run` returned.
 
-    Args:
-        scenario: what happens.
-        robot: ready to run.
-        out: an empty folder.
-        metadata: added to the log's facts, at least `lockstep` with the command or the network.
-        run: runs it, given the function that records a message and the one that sees the world.
-        watch: sees the world at its rate.
-        true_plant: that `run` simulates.
-        attached: names and files that go into the log as well.
-
-    Returns:
-        What `run` returned.
+    `run` gets the function that records a message and the one that sees the world, and simulates
+    `true_plant`. `metadata` is added to the log's facts, at least `lockstep` with the command or
+    the network. The files `attached` go into the log as well.
 
     Raises:
         RunError: the log cannot be written.
@@ -140,20 +129,10 @@ def simulate(
 ) -> float:
     """Record a run of the fleet in virtual time, to its end or a second past a fall.
 
-    Args:
-        robot: ready to run.
-        scenario: what happens.
-        network: of every link, beside the scenario's own impairments.
-        seed: of the sensors' noise and of the network.
-        out: an empty folder.
-        watch: sees the world at its rate.
-        control: a name of `CONTROLS`.
-        true_plant: the simulated robot; None: the robot file's.
-        hand: how somebody leads the hand in place of the scenario.
-        controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
-
-    Returns:
-        The simulated time, s.
+    Returns the simulated time, s. `network` comes on every link, beside the scenario's own
+    impairments; `seed` is of the sensors' noise and of the network. `control` is a name of
+    `CONTROLS`; `hand` leads in place of the scenario; `controller` is somebody's own,
+    `FILE.py[:NAME]`, in the place of the law.
 
     Raises:
         RunError: the log cannot be written.
@@ -190,17 +169,3 @@ def simulate(
     if controller is not None:
         metadata["controller"] = controller
     return record_run(scenario, robot, out, metadata, run, watch, true_plant, attached)
-
-
-def judge_in_lockstep(scenario: Scenario, out: Path, speed: float | None = None) -> Summary:
-    """Judge a run in virtual time.
-
-    Args:
-        scenario: what happened.
-        out: folder of `run.mcap`.
-        speed: of the simulation, as a multiple of real time.
-
-    Raises:
-        RunError: the log holds nothing to judge, or a file cannot be written.
-    """
-    return judge_run(out, f"{scenario.name} in lockstep", scenario.duration, speed=speed)

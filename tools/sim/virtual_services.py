@@ -29,6 +29,7 @@ from shared.bus.traces import PlannerCheckpoint
 from shared.can.sensor_frames import FrameGroup, ImuSample
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
+from shared.links import ATTITUDES, WRENCHES
 from shared.state import copied
 from tools.sim.network import VirtualLink, VirtualNetwork
 from tools.sim.virtual_drive import VirtualBus, VirtualDrive
@@ -47,12 +48,7 @@ class HostClock:
     """
 
     def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
-        """Begin.
-
-        Args:
-            offset_ns: ahead of virtual time at its zero.
-            drift_ppm: so much too fast, in millionths.
-        """
+        """Begin ahead of virtual time, and gain by `drift_ppm` millionths."""
         self.offset_ns = offset_ns
         self.drift_ppm = drift_ppm
 
@@ -134,10 +130,6 @@ class SharedMemory:
         """Say which planner is on this host."""
         self.planner = session
 
-    def end_planner(self) -> None:
-        """Let its process end."""
-        self.ended = self.planner
-
 
 class Neighbourhood:
     """One module's place in the shared memory: other modules, stops, the planner's end."""
@@ -212,10 +204,11 @@ class VirtualJoint:
         frame = MotorFrame(config.drive.zero_mark_turns, config.module_named(name).motor_signs)
         self._wired = WiredDrive(self.drive, frame)
         self._place = Neighbourhood(memory, index, time, self._clock)
+        links = network.links
         self._ports = JointPorts(
-            commands=LinkInbox(network.commands()[index], time),
+            commands=LinkInbox(links[f"planner->{name}"], time),
             estops=self._place,
-            states=RecordOutbox(record, topics.JOINT_STATE, name, network.states()[index], time),
+            states=RecordOutbox(record, topics.JOINT_STATE, name, links[f"{name}->planner"], time),
             events=RecordOutbox(record, topics.JOINT_EVENT, name),
             traces=RecordOutbox(record, topics.JOINT_TRACE, name) if traced else None,
             planner=self._place,
@@ -252,9 +245,7 @@ class VirtualJoint:
     def kill(self, *, for_good: bool) -> None:
         """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
-        self._place.write(
-            row_of(self.manager.state.controller, self._clock()), is_dead=self._is_dead
-        )
+        self._write_row(is_dead=self._is_dead)
 
     def restart(self) -> None:
         """Continue a frozen service; a dead one is replaced, and takes over its armed drive."""
@@ -302,16 +293,16 @@ class VirtualPlanner:
         self.frozen = self._is_dead = False
         self._config, self._make, self._clock = config, make, time.on(clock)
         self._memory = beside
-        commands = zip(MODULES, network.commands(), strict=True)
+        links = network.links
         checkpoints = RecordOutbox[PlannerCheckpoint](record, topics.PLANNER_CHECKPOINT)
         self._ports = PlannerPorts(
-            states=[LinkInbox(link, time) for link in network.states()],
-            wrench=LinkInbox(network.wrenches(), time),
-            attitude=LinkInbox(network.attitudes(), time),
+            states=[LinkInbox(links[f"{name}->planner"], time) for name in MODULES],
+            wrench=LinkInbox(links[WRENCHES], time),
+            attitude=LinkInbox(links[ATTITUDES], time),
             request=lambda _host_ns: request(),
             commands=[
-                RecordOutbox(record, topics.JOINT_COMMAND, name, link, time)
-                for name, link in commands
+                RecordOutbox(record, topics.JOINT_COMMAND, name, links[f"planner->{name}"], time)
+                for name in MODULES
             ],
             status=RecordOutbox(record, topics.PLANNER_STATUS),
             checkpoint=checkpoints if traced else None,
@@ -344,7 +335,7 @@ class VirtualPlanner:
         """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
         if self._is_dead and self._memory is not None:
-            self._memory.end_planner()
+            self._memory.ended = self._memory.planner
 
     def restart(self) -> None:
         """Continue a frozen planner; a dead one is replaced under the next session."""
@@ -401,7 +392,7 @@ class VirtualHarness:
         time: VirtualTime,
         clock: HostClock,
     ) -> None:
-        wrenches = RecordOutbox(record, topics.WRENCH, "", network.wrenches(), time)
+        wrenches = RecordOutbox(record, topics.WRENCH, "", network.links[WRENCHES], time)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), wrenches, self)
         self._robot, self._time, self._clock = robot, time, time.on(clock)
         self._request: TareRequest | None = None
@@ -441,7 +432,7 @@ class VirtualImu:
         clock: HostClock,
     ) -> None:
         self._robot, self._time, self._clock = robot, time, time.on(clock)
-        attitudes = RecordOutbox(record, topics.ATTITUDE, "", network.attitudes(), time)
+        attitudes = RecordOutbox(record, topics.ATTITUDE, "", network.links[ATTITUDES], time)
         self._loop = ImuLoop(frames, AttitudeLaw(config.imu), attitudes)
 
     def advance(self) -> None:

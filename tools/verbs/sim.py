@@ -18,6 +18,7 @@ from shared.extras import require
 from shared.toml_file import Range
 from tools.flags import Arg, Folder
 from tools.judge import verdict, verdict_table
+from tools.judge.figure import judge_run
 from tools.live import experiment
 from tools.logs.hand_path import HandRow, hand_path
 from tools.logs.run_log import read_run
@@ -103,7 +104,7 @@ def run(flags: SimFlags) -> int:
             )
             raise
     factor = simulated_s / (time.monotonic() - begin)
-    summary = recorded_lockstep.judge_in_lockstep(scenario, out, speed=factor)
+    summary = judge_run(out, f"{scenario.name} in lockstep", scenario.duration, speed=factor)
     verdict_table.show(summary, console)
     console.print(f"{factor:.1f} x real time; {out}/run.mcap, run.png, summary.json", style="dim")
     return verdict.exit_code(summary)

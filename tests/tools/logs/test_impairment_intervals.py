@@ -46,7 +46,7 @@ def test_an_impairment_of_many_directions_is_one_with_the_sum_of_their_counts() 
     (row,) = impairments(told(("planner->left", CUT, 3.0, 7.0)))
     assert row.directions == set(directions_of("planner->left"))
     assert (row.passed, row.lost) == (0, 3 * 4)
-    assert verdict.shown(row, NS_PER_S).said == (
+    assert verdict.shown(row, NS_PER_S) == (
         "planner->left partition: 2.00 to 6.00 s; 0 messages passed, 12 lost"
     )
 
@@ -61,7 +61,7 @@ def test_impairments_that_overlap_keep_each_its_own_begin_and_end() -> None:
 def test_an_impairment_without_an_end_in_the_log_is_reported_so() -> None:
     (row,) = impairments(told(("all", LATE, 3.0, 99.0)))
     assert row.when(0) == "from 3.00 s on"
-    assert "its end is not in the log" in verdict.shown(row, 0).said
+    assert "its end is not in the log" in verdict.shown(row, 0)
     assert row.at(1 << 60)
 
 

@@ -117,7 +117,6 @@ REFUSALS: Final = {
     "log export LOG --csv t --rate 0": "a number from 0.001 to 10000 Hz",
     "log export LOG --csv t --rate nan": "a number from 0.001 to 10000 Hz",
     "log export LOG --gif x.gif --topic sim/truth": "--topic chooses what is in tables",
-    "log export LOG --csv t --curves": "--curves go beside a picture",
     "log report LOG --from 3 --to 2": "--from 3 --to 2: the first is to be the smaller one",
     "log report LOG -o LOG": "is the record itself",
     "log report LOG -o .": "is a directory",
@@ -182,8 +181,9 @@ REFUSALS: Final = {
     "study robust --slope 40": "--slope: '40': a number from 0 to",
     "study push --duration 0": "--duration: '0': a number of at least",
     "study latency --loss 1.5": "from 0 to 1",
-    "study latency --control mine": "'mine'; some of distributed, diagonal, centralised",
-    "study latency --delay 0-200": "FROM:TO:STEP",
+    "study latency --control mine": "'mine': one of distributed, diagonal, centralised",
+    "study latency --control ,": "name at least one of distributed",
+    "study latency --delay 0-200": "numbers from 0 to 60000 with commas",
     "study latency --lead-easing 2": "lead_easing",
     "study crash --only kill-kne_left": (
         "--only kill-kne_left: no such case; perhaps kill-knee_left, kill-ankle_left, "

@@ -2,23 +2,119 @@
 
 from __future__ import annotations
 
+import argparse
+import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+from unittest import mock
 
+from services.joint.failsafe import TRANSITIONS, Event
 from shared.arguments import FlagParser
+from shared.bus.messages import Mode
+from shared.config.files import load
 from shared.exceptions import FAULT_EXIT_CODE
-from tools.dev.reference import faults, modes, robot_file, topics, verbs
+from shared.places import DEFAULT_CONFIG
+from tools.cli import whole_parser
+from tools.dev.reference import robot_file, topics
+from tools.dev.reference.markdown import cell_docs, one_line, table
+from tools.verb_table import VERBS
+from tools.verbs.faults import sections as fault_sections
 
 FOLDER: Final = Path(__file__).resolve().parents[3] / "docs" / "reference"
+_FAULTS: Final = """\
+# Faults
+
+`xrl faults` prints this page's tables. Lockstep tests hold the robot to each row of the first two
+tables, and `xrl study crash` does so live. A module that lost torque is never re-armed
+automatically, even if its service restarts: a person mends the cause, then restarts the service.
+"""
+_MODES: Final = """\
+# Modes of a joint service
+
+The joint service acts on one event a cycle, the gravest first (the table's order). An event that a
+mode does not list changes nothing. The reasons behind the machine: [](../architecture.md#modes).
+"""
+_WIDTH: Final = "96"
+_VERBS: Final = """\
+# Verbs
+
+`xrl` is `.venv/bin/xrl`; `./deploy/demo`, `up`, `down`, `status` and `kill` are the same verbs with
+the environment made first. `xrl --version` prints version and commit, `xrl help VERB` what
+`xrl VERB --help` does.
+
+| exit code | meaning |
+|---|---|
+| 0 | success |
+| 1 | a robot fell, or is about to fall; nothing else |
+| 2 | bad input, a person declined, the fleet cannot start, or the system refused a request |
+| 3 | a check found a fault or a difference, or no message came |
+| 70 | a fault of `xrl` itself: please report its traceback |
+| 129 | its terminal is gone, as after a dropped ssh session |
+| 130, 141, 143 | Ctrl-C; the reader of its output ended (`xrl ... \\| head`); SIGTERM |
+
+A pipe or a file gets whole tables, without frames and colours. Control characters in a log, on the
+bus or in a file's name are printed escaped, such as `\\u001b`.
+"""
+
+
+def faults_page() -> Iterator[str]:
+    """Yield the page of faults: what happens, and what a person does."""
+    yield _FAULTS
+    for title, about, headings, rows in fault_sections(load(DEFAULT_CONFIG).trips):
+        yield f"## {title}\n\n{about}\n"
+        cells = ((f"`{name}`", *map(one_line, others)) for name, *others in rows)
+        yield from table(" | ".join(headings), cells)
+        yield ""
+
+
+def modes_page() -> Iterator[str]:
+    """Yield the page of the joint service's state machine."""
+    docs = cell_docs(Event)
+    rows = []
+    for event in Event:
+        cells = [_after(mode, event) for mode in Mode]
+        if any(cells):
+            about = f": {docs[event.name]}" if event.name in docs else ""
+            rows.append([f"`{event.name}`{about}", *cells])
+    headings = " | ".join(["event", *(f"in {mode.name}" for mode in Mode)])
+    yield _MODES
+    yield from table(headings, rows)
+
+
+def _after(mode: Mode, event: Event) -> str:
+    row = TRANSITIONS[mode].get(event)
+    return row[0].name if row else ""
+
+
+def verbs_page() -> Iterator[str]:
+    """Yield the page of the command line: each verb's own help."""
+    with mock.patch.dict(os.environ, COLUMNS=_WIDTH):  # argparse wraps by it
+        helps = list(_helps(whole_parser()))
+    rows = ((f"[`{verb.name}`](#xrl-{verb.name.replace(' ', '-')})", verb.help) for verb in VERBS)
+    yield _VERBS
+    yield from table("verb | what it does", rows)
+    for name, text in helps:
+        yield f"\n## xrl {name}\n\n```text\n{text.rstrip()}\n```"
+
+
+def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
+    """Yield name and help of every verb below a parser."""
+    actions = parser._subparsers._group_actions if parser._subparsers else []  # noqa: SLF001
+    choices: list[Any] = [action.choices for action in actions]  # of sub-parsers it is a dictionary
+    for found in choices:
+        for below in found.values():
+            yield below.prog.removeprefix("xrl "), below.format_help()
+            yield from _helps(below)
+
+
 PAGES: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "topics.md": topics.page,
     "robot-file.md": robot_file.page,
-    "verbs.md": verbs.page,
-    "faults.md": faults.page,
-    "modes.md": modes.page,
-    "modes.svg": modes.diagram,
+    "verbs.md": verbs_page,
+    "faults.md": faults_page,
+    "modes.md": modes_page,
 }
 """Lines of the generated files, by name."""
 

@@ -1,14 +1,11 @@
-"""The moving picture of a run: the robot from the side and from the front, as an animated GIF.
-
-Beside it curves may grow: the paper's Fig. 7 as an animation.
-"""
+"""The moving picture of a run: the robot from the side and from the front, as an animated GIF."""
 
 from __future__ import annotations
 
-import bisect
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
@@ -26,60 +23,18 @@ from tools.judge.reports.robot_pose import FORCE_MIN_N, RobotPose, frames, poses
 from tools.logs.run_log import RunLog
 
 Point = tuple[float, float]
-SCALE: Final = 2
-"""Drawn larger and reduced, so that lines are smooth."""
-
-
-class Canvas:
-    """Drawing in pixels of the picture, on an image that is larger."""
-
-    def __init__(self, draw: ImageDraw.ImageDraw) -> None:
-        self._draw = draw
-
-    def line(self, points: Sequence[Point], colour: str, width: float) -> None:
-        """Draw a line through points."""
-        self._draw.line(_scaled(points), fill=colour, width=round(width * SCALE), joint="curve")
-
-    def polygon(self, points: Sequence[Point], colour: str) -> None:
-        """Fill a polygon."""
-        self._draw.polygon(_scaled(points), fill=colour)
-
-    def disc(self, at: Point, radius: float, colour: str) -> None:
-        """Fill a disc."""
-        (x, y), r = at, radius
-        self._draw.ellipse(_scaled([(x - r, y - r), (x + r, y + r)]), fill=colour)
-
-    def arrow(self, at: Point, by: Point, colour: str) -> None:
-        """Draw an arrow from a point by a vector; none that is shorter than a pixel."""
-        length = float(np.hypot(*by))
-        if length < 1.0:
-            return
-        x, y = at[0] + by[0], at[1] + by[1]
-        ux, uy = by[0] / length, by[1] / length
-        self.line([at, (x, y)], colour, 4.0)
-        tip = [(x + 9 * ux, y + 9 * uy), (x - 7 * uy, y + 7 * ux), (x + 7 * uy, y - 7 * ux)]
-        self.polygon(tip, colour)
-
-    def text(self, at: Point, text: str, colour: str, size: int) -> None:
-        """Write a text whose upper left corner is at a point."""
-        font = ImageFont.load_default(size * SCALE)
-        self._draw.text((at[0] * SCALE, at[1] * SCALE), text, fill=colour, font=font)
-
-
-def _scaled(points: Sequence[Point]) -> list[Point]:
-    return [(x * SCALE, y * SCALE) for x, y in points]
-
-
 FRAMES_S: Final = 12.5
 """Frames per second; a GIF counts in hundredths of a second."""
+SCALE: Final = 2
+"""Drawn larger and reduced, so that lines are smooth."""
 SIZE: Final = (640, 400)
 COLOURS_MAX: Final = 64
 MIXTURES: Final = 4
 """Shades of each ink, for smooth edges."""
-PX_PER_M: Final = 200.0
-GROUND_Y: Final = 365.0
-PX_PER_N: Final = 0.9
-VIEWS: Final = ((170.0, 0, 1.0), (465.0, 1, -1.0))
+PX_PER_M: Final = 200.0 * SCALE
+GROUND_Y: Final = 365.0 * SCALE
+PX_PER_N: Final = 0.9 * SCALE
+VIEWS: Final = ((170.0 * SCALE, 0, 1.0), (465.0 * SCALE, 1, -1.0))
 """Centre, px; which horizontal axis (0: x, from the side; 1: y, from the front); its sign."""
 BACKGROUND, INK, LINK, TORSO, COM_INK = "#ffffff", "#30363d", "#7b858f", "#c9d1d9", "#0d5ea6"
 HAND_INK, PUSH_INK = "#c44f1c", "#8c3399"
@@ -92,40 +47,24 @@ MODE_INK: Final[dict[int, str]] = {
 }
 
 
-class Caption(NamedTuple):
-    """Caption of the picture from a time on."""
-
-    t_ns: int
-    text: str
-
-
 def write_gif(
-    log: RunLog,
-    robot: RobotConfig,
-    path: Path,
-    progress: Callable[[float], None],
-    *,
-    with_curves: bool = False,
+    log: RunLog, robot: RobotConfig, path: Path, progress: Callable[[float], None]
 ) -> int:
     """Draw a run, from its scenario's begin, and return the number of frames.
 
     The pose is the simulated world's, or as the legs know the torso. `progress` takes 0 .. 1.
     """
-    began = _began_ns(log)
+    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
+    began = next((event.t_ns for event in events if event.kind == RunEventKind.STARTED), 0)
     chosen = [pose for pose in poses(log, robot, FRAMES_S) if pose.t_ns >= began]
     if not chosen:
         raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
-    captions = _captions(log, began)
     images = []
-    curves = Curves(chosen, began) if with_curves else None
     for number, pose in enumerate(chosen):
-        width = SIZE[0] + (WIDTH if curves is not None else 0)
-        image = Image.new("RGB", (width * SCALE, SIZE[1] * SCALE), BACKGROUND)
-        canvas = Canvas(ImageDraw.Draw(image))
-        _draw_frame(canvas, robot, pose, (pose.t_ns - began) / NS_PER_S, captions)
-        if curves is not None:
-            curves.draw(canvas, number)
-        images.append(image.resize((width, SIZE[1]), Image.Resampling.LANCZOS))
+        image = Image.new("RGB", (SIZE[0] * SCALE, SIZE[1] * SCALE), BACKGROUND)
+        caption = f"{(pose.t_ns - began) / NS_PER_S:4.1f} s   {_caption(events, pose)}"
+        _draw_frame(ImageDraw.Draw(image), robot, pose, caption)
+        images.append(image.resize(SIZE, Image.Resampling.LANCZOS))
         progress((number + 1) / len(chosen))
     palette = _palette()
     flat = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -171,44 +110,51 @@ def _palette() -> Image.Image:
     return swatches.quantize(COLOURS_MAX)
 
 
-def _began_ns(log: RunLog) -> int:
-    """Return when the scenario began; the log's begin if it has none."""
-    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
-    started = [event.t_ns for event in events if event.kind == RunEventKind.STARTED]
-    return started[0] if started else 0
-
-
-def _captions(log: RunLog, began: int) -> list[Caption]:
-    captions = [Caption(began, "led by the hand")]
-    events: list[RunEvent] = log.messages(topics.RUN_EVENT)
+def _caption(events: Sequence[RunEvent], pose: RobotPose) -> str:
+    words = "led by the hand"
     for event in events:
-        if event.kind == RunEventKind.KILLED:
-            captions.append(Caption(event.t_ns, f"{event.subject} killed: it holds"))
-        elif event.kind == RunEventKind.RESTARTED:
-            captions.append(Caption(event.t_ns, f"{event.subject} started again"))
-    return captions
+        if event.t_ns <= pose.t_ns and event.kind == RunEventKind.KILLED:
+            words = f"{event.subject} killed: it holds"
+        elif event.t_ns <= pose.t_ns and event.kind == RunEventKind.RESTARTED:
+            words = f"{event.subject} started again"
+    return words + ("   push" if any(pose.push) else "")
 
 
 def _draw_frame(
-    canvas: Canvas, robot: RobotConfig, pose: RobotPose, seconds: float, captions: Sequence[Caption]
+    canvas: ImageDraw.ImageDraw, robot: RobotConfig, pose: RobotPose, caption: str
 ) -> None:
     frames = world_frames(robot, pose)
-    canvas.line([(20.0, GROUND_Y), (SIZE[0] - 20.0, GROUND_Y)], INK, 1.5)
-    for centre, axis, sign in VIEWS:
-        _draw_robot(canvas, robot, pose, frames, (centre, axis, sign))
-    caption = captions[max(0, bisect.bisect_right([c.t_ns for c in captions], pose.t_ns) - 1)]
-    lead = "   push" if any(pose.push) else ""
-    canvas.text((20.0, 14.0), f"{seconds:4.1f} s   {caption.text}{lead}", INK, 17)
-    canvas.text(
-        (20.0, 38.0), f"height {pose.torso[2]:.3f} m   hand {abs(pose.force[2]):3.0f} N", INK, 14
-    )
+    width, text = SIZE[0] * SCALE, partial(_text, canvas)
+    canvas.line([(20.0 * SCALE, GROUND_Y), (width - 20.0 * SCALE, GROUND_Y)], INK, 3)
+    for view in VIEWS:
+        _draw_robot(canvas, robot, pose, frames, view)
+    text((20, 14), caption, 17)
+    text((20, 38), f"height {pose.torso[2]:.3f} m   hand {abs(pose.force[2]):3.0f} N", 14)
     for number, mode in enumerate((Mode.TRACK, Mode.HOLD)):
-        canvas.disc((520.0, 24.0 + 22.0 * number), 6.0, MODE_INK[mode])
-        canvas.text((534.0, 15.0 + 22.0 * number), mode.name, INK, 14)
+        canvas.circle((520.0 * SCALE, (24 + 22 * number) * SCALE), 6.0 * SCALE, MODE_INK[mode])
+        text((534, 15 + 22 * number), mode.name, 14)
+
+
+def _text(canvas: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int) -> None:
+    """Write a text whose upper left corner is at a pixel of the picture."""
+    font = ImageFont.load_default(size * SCALE)
+    canvas.text((at[0] * SCALE, at[1] * SCALE), text, fill=INK, font=font)
+
+
+def _arrow(canvas: ImageDraw.ImageDraw, at: Point, by: Point, ink: str) -> None:
+    """Draw an arrow from a point by a vector; none that is shorter than a pixel."""
+    length = float(np.hypot(*by))
+    if length < SCALE:
+        return
+    x, y = at[0] + by[0], at[1] + by[1]
+    ux, uy = by[0] / length * SCALE, by[1] / length * SCALE
+    canvas.line([at, (x, y)], ink, 4 * SCALE)
+    tip = [(x + 9 * ux, y + 9 * uy), (x - 7 * uy, y + 7 * ux), (x + 7 * uy, y - 7 * ux)]
+    canvas.polygon(tip, ink)
 
 
 def _draw_robot(
-    canvas: Canvas,
+    canvas: ImageDraw.ImageDraw,
     robot: RobotConfig,
     pose: RobotPose,
     frames: dict[str, tuple[Array, Quaternion]],
@@ -235,94 +181,19 @@ def _draw_robot(
     geometry = robot.geometry
     canvas.polygon(box("torso", geometry.torso_size, (0.0, 0.0, 0.0)), TORSO)
     hips = [at(frames[f"hip_{side}"][0]) for side in SIDES]
-    canvas.line(hips, LINK, 7.0)
+    canvas.line(hips, LINK, 7 * SCALE)
     foot = (geometry.l_foot, geometry.w_foot, geometry.foot_height)
     for side in SIDES:
         joints = [at(frames[f"{kind}_{side}"][0]) for kind in ("ankle", "knee", "hip")]
         canvas.polygon(box(f"ankle_{side}", foot, (0.0, 0.0, -foot[2] / 2)), INK)
-        canvas.line(joints, LINK, 7.0)
+        canvas.line(joints, LINK, 7 * SCALE, joint="curve")
         for kind, joint in zip(("ankle", "knee", "hip"), joints, strict=True):
             mode = pose.modes[MODULES.index(f"{kind}_{side}")]
-            canvas.disc(joint, 8.5, MODE_INK.get(mode, INK))
-    canvas.disc(at(np.array(pose.com)), 5.0, COM_INK)
+            canvas.circle(joint, 8.5 * SCALE, MODE_INK.get(mode, INK))
+    canvas.circle(at(np.array(pose.com)), 5.0 * SCALE, COM_INK)
     harness = at(frames["harness"][0])
     if abs(pose.force[2]) >= FORCE_MIN_N:
-        canvas.arrow(harness, (0.0, -PX_PER_N * pose.force[2]), HAND_INK)
+        _arrow(canvas, harness, (0.0, -PX_PER_N * pose.force[2]), HAND_INK)
     if pose.push[axis]:
-        canvas.arrow(at(np.array(pose.torso)), (sign * PX_PER_N * pose.push[axis], 0.0), PUSH_INK)
-
-
-WIDTH: Final = 440
-"""By which the picture is wider, px."""
-TOP, HEIGHT, GAP = 66.0, 84.0, 22.0
-LEFT, RIGHT = 64.0, 16.0
-CURVES_X, CURVES_WIDTH = SIZE[0] + LEFT, WIDTH - LEFT - RIGHT
-CURVE_INKS: Final = (HAND_INK, COM_INK)
-
-
-class CurvePanel(NamedTuple):
-    """One panel: what it shows, and its lines' inks."""
-
-    title: str
-    values: Callable[[RobotPose], tuple[float, ...]]
-    names: tuple[str, ...]
-    least: float
-    """Smallest span of its axis."""
-
-
-PANELS: Final = (
-    CurvePanel("COM, mm", lambda pose: (1e3 * pose.com[0], 1e3 * pose.com[1]), ("x", "y"), 20.0),
-    CurvePanel("height, m", lambda pose: (pose.torso[2],), ("torso",), 0.1),
-    CurvePanel("hand, N", lambda pose: (-pose.force[2],), ("robot on hand",), 20.0),
-)
-
-
-class Curves:
-    """All panels of a run."""
-
-    def __init__(self, poses: Sequence[RobotPose], began_ns: int) -> None:
-        self._t = [(pose.t_ns - began_ns) / NS_PER_S for pose in poses]
-        self._columns = [list(zip(*map(panel.values, poses), strict=True)) for panel in PANELS]
-        self._ranges = [
-            _range(columns, p.least) for columns, p in zip(self._columns, PANELS, strict=True)
-        ]
-
-    def draw(self, canvas: Canvas, number: int) -> None:
-        """Draw all curves up to a frame."""
-        for index, panel in enumerate(PANELS):
-            top = TOP + index * (HEIGHT + GAP)
-            low, high = self._ranges[index]
-            for value in (low, high):
-                y = self._y(value, index)
-                canvas.line([(CURVES_X, y), (CURVES_X + CURVES_WIDTH, y)], INK, 0.5)
-                canvas.text((CURVES_X - 46.0, y - 7.0), f"{value:.3g}", INK, 11)
-            canvas.text((CURVES_X, top - 17.0), panel.title, INK, 12)
-            for line, name in enumerate(panel.names):
-                canvas.text((CURVES_X + 90.0 + 60.0 * line, top - 17.0), name, CURVE_INKS[line], 12)
-                values = self._columns[index][line][: number + 1]
-                points = [
-                    (self._x(t), self._y(value, index))
-                    for t, value in zip(self._t, values, strict=False)
-                ]
-                if len(points) > 1:
-                    canvas.line(points, CURVE_INKS[line], 1.6)
-        x, bottom = self._x(self._t[number]), TOP + len(PANELS) * (HEIGHT + GAP) - GAP
-        canvas.line([(x, TOP), (x, bottom)], INK, 0.5)
-        canvas.text((x - 12.0, bottom + 4.0), f"{self._t[number]:.1f} s", INK, 11)
-
-    def _x(self, t: float) -> float:
-        begin, end = self._t[0], self._t[-1]
-        return CURVES_X + CURVES_WIDTH * (t - begin) / max(1e-9, end - begin)
-
-    def _y(self, value: float, index: int) -> float:
-        low, high = self._ranges[index]
-        top = TOP + index * (HEIGHT + GAP)
-        return top + HEIGHT * (high - value) / (high - low)
-
-
-def _range(columns: Sequence[Sequence[float]], least: float) -> tuple[float, float]:
-    """Return a panel's limits: its values and a margin, at least so far apart."""
-    low = min(min(column) for column in columns)
-    high = max(max(column) for column in columns)
-    more = max(0.05 * (high - low), 0.5 * (least - (high - low)))
-    return low - more, high + more
+        by = (sign * PX_PER_N * pose.push[axis], 0.0)
+        _arrow(canvas, at(np.array(pose.torso)), by, PUSH_INK)

@@ -13,10 +13,11 @@ import numpy as np
 from shared.arrays import Array
 from shared.clock import NS_PER_S
 from shared.exceptions import RunError
+from shared.mcap_log.sequence_stats import KeyCount
 from tools.judge.reports.events import Events, TimelineEvent
 from tools.judge.reports.panels import COLOURS, GAP_S, Bar, Line, Panel, panels_of
 from tools.judge.reports.run_data import RunData, Span
-from tools.judge.reports.summary import Judge, MessageLosses, inputs, verdict_and_facts
+from tools.judge.reports.summary import Judge, inputs, verdict_and_facts
 from tools.judge.run_parts import zero_ns
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import PART_S, SEE_INFO, WHOLE, RunLog, RunPart, parts_of
@@ -120,7 +121,7 @@ class Page:
         self._panels: dict[str, _PanelData] = {}
         self._events = Events()
         self._judge = Judge()
-        self._losses = MessageLosses()
+        self._counts: dict[str, KeyCount] = {}
 
     def add(self, log: RunLog) -> None:
         """Add a run, or the next part of it."""
@@ -133,8 +134,8 @@ class Page:
         for panel in panels:
             self._panels.setdefault(panel.title, _PanelData(panel)).add(panel, run)
         self._events.add(run, panels)
-        self._losses.add(run)
-        self._judge.add(run, self._losses.counts)
+        log.count_into(self._counts)
+        self._judge.add(run, self._counts)
 
     def html(self) -> str:
         """Return the page."""
@@ -152,11 +153,10 @@ class Page:
         }
         empty = ", ".join(title for title, data in found.items() if data is None)
         parts = (
-            verdict_and_facts(run, verdict, name),
+            verdict_and_facts(run, verdict, name, self._counts),
             _tools(run),
             f'<div class="work">{_listed(events)}<main id="panels"></main></div>',
             f'<p class="hint" id="left-out">The log has no data for: {empty}.</p>' if empty else "",
-            self._losses.html(run),
             inputs(run),
         )
         text = json.dumps(data, separators=(",", ":"), allow_nan=False)

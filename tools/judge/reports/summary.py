@@ -1,17 +1,14 @@
-"""Head and foot of a page: verdict, facts about the run, lost messages, input files."""
+"""Head and foot of a page: verdict, facts about the run, input files."""
 
 from __future__ import annotations
 
 import io
-import json
 import tomllib
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 from html import escape
 from typing import Any, Final, NamedTuple
 
-from shared.bus import topics
-from shared.clock import NS_PER_S
 from shared.exceptions import XrlError
 from shared.mcap_log.recover import describe_lost
 from shared.mcap_log.sequence_stats import KeyCount
@@ -85,7 +82,9 @@ def _scenario_of(run: RunData) -> dict[str, Any]:
         return {}
 
 
-def verdict_and_facts(run: RunData, found: RunVerdict, name: str) -> str:
+def verdict_and_facts(
+    run: RunData, found: RunVerdict, name: str, counts: dict[str, KeyCount]
+) -> str:
     """Return the head of the page."""
     word = {True: "good", False: "bad", None: "none"}[found.good]
     caution = f'<p class="caution">{escape(found.caution)}</p>' if found.caution else ""
@@ -97,7 +96,8 @@ def verdict_and_facts(run: RunData, found: RunVerdict, name: str) -> str:
         cells = _table(("figure", "measured", "limit", ""), found.rows, numbers=(1, 2))
         table = _details(f"Figures against their limits: {count}", cells, is_open=True)
     facts = "".join(
-        f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>" for key, value in _facts(run)
+        f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
+        for key, value in _facts(run, counts)
     )
     return (
         f"<header><h1>{escape(run.log.robot)}: {escape(name)}</h1>"
@@ -106,11 +106,15 @@ def verdict_and_facts(run: RunData, found: RunVerdict, name: str) -> str:
     )
 
 
-def _facts(run: RunData) -> list[tuple[str, str]]:
+def _facts(run: RunData, counts: dict[str, KeyCount]) -> list[tuple[str, str]]:
     """Return (name, value) of the facts that a reader needs first."""
     log, about = run.log, run.log.metadata["run"]
     begin, end = run.span
     scenario = (about.get("scenario", ""), str(_scenario_of(run).get("about", "")))
+    recording = [] if log.complete else [INCOMPLETE]
+    if log.damage or not log.complete:
+        recording += describe_lost(log.cut, log.damage, finished=log.complete)
+    missing = sum(one.missing for one in counts.values())
     changed = " with changes" if about.get("git_dirty") == "true" else ""
     rows = [
         ("scenario", ": ".join(filter(None, scenario))),
@@ -118,23 +122,14 @@ def _facts(run: RunData) -> list[tuple[str, str]]:
         ("virtual time", about.get("lockstep", "")),
         ("length", f"{end - begin:.1f} s"),
         ("file", log.path.name),
-        ("recording", "complete" if log.complete else INCOMPLETE),
+        ("recording", "; ".join(recording) or "complete"),
+        ("messages lost", f"{missing}; `xrl log info` shows which" if missing else "none"),
         ("git commit", about.get("git_commit", "") + changed),
         ("robot", log.robot),
         ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
         *((name, about.get(key, "")) for key, name in MACHINE.items()),
-        ("threads", _threads(about.get("thread_env", ""))),
     ]
     return [(name, value) for name, value in rows if value]
-
-
-def _threads(raw: str) -> str:
-    """Return the environment variables that limit threads; the raw text if it is not JSON."""
-    try:
-        found = json.loads(raw or "{}")
-        return ", ".join(f"{name}={value}" for name, value in sorted(found.items()))
-    except (ValueError, AttributeError, RecursionError):
-        return raw
 
 
 def _date(started: str) -> str:
@@ -143,51 +138,6 @@ def _date(started: str) -> str:
         return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
     except ValueError:
         return started
-
-
-class MessageLosses:
-    """Recorded and lost messages of each topic, by sequence numbers."""
-
-    def __init__(self) -> None:
-        self.counts: dict[str, KeyCount] = {}
-        self._times_ns: dict[str, tuple[int, int]] = {}
-
-    def add(self, run: RunData) -> None:
-        """Add a run, or the next part of it."""
-        log = run.log
-        log.count_into(self.counts)
-        for key in log.keys():  # noqa: SIM118 - a log is no mapping
-            times = [t_ns for t_ns, _, _ in log.raw(key) if log.holds(t_ns)]
-            if times:
-                first_ns, last_ns = min(times), max(times)
-                self._times_ns[key] = (self._times_ns.get(key, (first_ns, 0))[0], last_ns)
-
-    def html(self, run: RunData) -> str:
-        """Return a table with a row for each topic that has messages, and the file's damage."""
-        log = run.log
-        known, cells = topics.all_keys(log.robot), []
-        for key, count in sorted((key, one) for key, one in self.counts.items() if one.count):
-            first_ns, last_ns = self._times_ns[key]
-            span_s = (last_ns - first_ns) / NS_PER_S
-            nominal_hz = known[key].rate_hz if key in known else 0.0
-            rate = f"{(count.count - 1) / span_s:.1f}" if nominal_hz and span_s > 0.0 else ""
-            cells.append((
-                key.removeprefix(f"xrl/{log.robot}/"), str(count.count), rate,
-                f"{nominal_hz:g}" if nominal_hz else "",
-                *map(str, (count.missing, count.gaps, count.restarts)),
-            ))  # fmt: skip
-        damage = []
-        if log.damage or not log.complete:
-            damage = describe_lost(log.cut, log.damage, finished=log.complete)
-        missing = sum(one.missing for one in self.counts.values())
-        title = (
-            f"Messages: {missing} lost on the way to the log" if missing else "Messages: none lost"
-        )
-        names = ("topic", "messages", "Hz", "nominal Hz", "lost", "gaps", "restarts")
-        lines = "".join(f"<li>{escape(line)}</li>" for line in damage)
-        body = (f"<ul>{lines}</ul>" if damage else "") + _table(names, cells, numbers=range(1, 7))
-        is_open = bool(missing or damage)
-        return f'<section id="lost">{_details(title, body, is_open=is_open)}</section>'
 
 
 def inputs(run: RunData) -> str:

@@ -88,19 +88,15 @@ def measure(demo: Sequence[str]) -> Turn:
 
 
 def figures(summary: Mapping[str, Any], first_use: Array) -> Turn:
-    """Return a run's figures, from its summary.json and `first_use_ms`."""
+    """Return a run's figures, from its summary.json and `first_use_ms`; None if one is unknown."""
     ages: dict[str, float] = {}
     if first_use.size:
         ages["median"], ages["p99"] = np.percentile(first_use, [50.0, 99.0]).tolist()
-    known = {**summary, FIRST_USE: ages}
-    return {figure.what: _at(known, path) for path, figure in FIGURES.items()}
-
-
-def _at(known: Any, path: Sequence[str]) -> float | None:
-    for key in path:
-        known = known.get(key) if known else None
-    found: float | None = known
-    return found
+    known: Any = {**summary, FIRST_USE: ages}
+    return {
+        figure.what: (known.get(path[0]) or {}).get(path[1]) if path[1:] else known.get(path[0])
+        for path, figure in FIGURES.items()
+    }
 
 
 def first_use_ms(log: RunLog) -> Array:

@@ -287,54 +287,39 @@ class Bench:
         """Run a squat in virtual time and prepare every part with what it met."""
         recorded = record(robot, squat)
         self._parts = {part.name: part.prepare(recorded, stack) for part in PARTS}
-        self._runs = {
-            name: LockstepRun(robot, squat, stack, recorded="record" in name) for name in LOCKSTEP
-        }
+        self._robot, self._squat = robot, squat
+        self._writer = _writer(robot, stack)
 
     def turn(self) -> Turn:
         """Return each part's cost, us, and the speeds of lockstep, times real time."""
-        found: Turn = {name: run.speed() for name, run in self._runs.items()}
+        found: Turn = {
+            name: lockstep_speed(self._robot, self._squat, self._writer if record else None)
+            for name, record in zip(LOCKSTEP, (False, True), strict=True)
+        }
         for name, part in self._parts.items():
             for how, calls in CALLS.items():
                 found[f"{name}, {how}"] = measure(part, calls, cold=how == "cold")
         return found
 
 
-class LockstepRun:
-    """A squat in virtual time, measured piece by piece, from the start of the scenario on."""
+def lockstep_speed(robot: RobotConfig, scenario: Scenario, writer: RunWriter | None) -> float:
+    """Return how many times faster than real time one core runs the scenario's first `PIECE_S`.
 
-    def __init__(
-        self, robot: RobotConfig, scenario: Scenario, stack: ExitStack, *, recorded: bool
-    ) -> None:
-        """Stand the robot up: that is not measured."""
-        self._robot, self._scenario, self._recorded = robot, scenario, recorded
-        self._writer = _writer(robot, stack) if recorded else None
-        self._begin()
-
-    def speed(self) -> float:
-        """Run a piece; return how many times faster than real time one core does it."""
-        if self._fleet.world.scenario_s > SECONDS:
-            self._begin()
-        end_s = self._fleet.world.scenario_s + PIECE_S
-        begin, started_ns = time.process_time(), self._fleet.now_ns
-        for truth in self._run:
-            if self._writer is not None and len(self._outbox) >= DRAIN_EVERY:
-                self._writer.take_from(self._outbox, len(self._outbox))
-            if truth.scenario_s >= end_s:
-                break
-        return (self._fleet.now_ns - started_ns) / NS_PER_S / (time.process_time() - begin)
-
-    def _begin(self) -> None:
-        self._outbox = RecordedMessages(self._robot.name)
-        record = self._outbox.put if self._recorded else forget
-        self._fleet = Lockstep(self._robot, self._scenario, record=record, traced=self._recorded)
-        begin_standing(self._fleet)
-        self._run = self._fleet.run()
-        for truth in self._run:
-            if truth.scenario_s >= 0.0:
-                break
-        if self._writer is not None:
-            self._writer.take_from(self._outbox, len(self._outbox))
+    To stand up is not measured. With a writer the run is recorded.
+    """
+    outbox = RecordedMessages(robot.name)
+    take = forget if writer is None else outbox.put
+    fleet = Lockstep(robot, scenario, record=take, traced=writer is not None)
+    begin_standing(fleet)
+    begin, begin_ns = 0.0, 0
+    for truth in fleet.run():
+        if truth.scenario_s >= 0.0 and not begin_ns:
+            begin, begin_ns = time.process_time(), fleet.now_ns
+        if writer is not None and len(outbox) >= DRAIN_EVERY:
+            writer.take_from(outbox, len(outbox))
+        if truth.scenario_s >= PIECE_S:
+            break
+    return (fleet.now_ns - begin_ns) / NS_PER_S / (time.process_time() - begin)
 
 
 def _writer(robot: RobotConfig, stack: ExitStack) -> RunWriter:

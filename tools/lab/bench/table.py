@@ -11,7 +11,7 @@ import sys
 import tarfile
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any, Final, NamedTuple, TypeAlias
@@ -66,13 +66,6 @@ class Row(NamedTuple):
         if self.target is None or self.value is None:
             return True
         return self.value >= self.target if self.unit == "x" else self.value <= self.target
-
-    def marked_target(self) -> Text | str:
-        """Return the target and whether it is met, for a cell."""
-        if self.target is None:
-            return ""
-        mark = Text("ok", "green") if self.ok else Text("missed", "yellow")
-        return marked("{} {:g} {}", ">=" if self.unit == "x" else "<=", self.target, mark)
 
 
 def row_of(figure: Figure, here: Sequence[Turn], there: Sequence[Turn]) -> Row:
@@ -132,12 +125,8 @@ def run_turns(
 ) -> tuple[list[Turn], list[Turn]]:
     """Return the turns of this tree, and of the one of `--against`, which take turns.
 
-    Args:
-        flags: of the verb.
-        words: the verb with its flags, for a tree that runs in a process of its own.
-        rounds: turns of each tree.
-        measure: one turn of this tree.
-        console: for the progress bar.
+    `measure` makes one turn of this tree; `words` are the verb with its flags, for a tree that
+    runs in a process of its own.
     """
     each = track(range(rounds), "measuring", console=console, transient=True)
     if flags.against is None:
@@ -179,25 +168,17 @@ def unpacked(revision: str) -> Iterator[Path]:
             raise RunError(f"{revision}: no git revision here ({reason}); such as HEAD~1")
         with tarfile.open(archive) as packed:
             packed.extractall(tree)  # noqa: S202 - git's own
-        run_module(tree, "tools.graph_libraries", [])  # else CasADi interprets its law
+        with suppress(RunError):  # CasADi then interprets its law
+            run_tree(tree, [], "tools.graph_libraries")
         yield tree
 
 
-def run_tree(tree: Path, words: Sequence[str]) -> str:
-    """Run `xrl` of a source tree; return its output.
+def run_tree(tree: Path, words: Sequence[str], module: str = "tools.cli") -> str:
+    """Run `xrl`, or another module, of a source tree; return its output. Ctrl-C reaches it as well.
 
     Raises:
         RunError: it ended with an error, or not in time.
     """
-    code, output = run_module(tree, "tools.cli", words)
-    if code:
-        last = " / ".join(output.strip().splitlines()[-3:])
-        raise RunError(f"{tree}: `xrl {words[0]}` ended with {code}: {last}")
-    return output
-
-
-def run_module(tree: Path, module: str, words: Sequence[str]) -> tuple[int, str]:
-    """Run a module of a source tree; return its exit code and output. Ctrl-C reaches it as well."""
     process = subprocess.Popen(
         [sys.executable, "-m", module, *words],
         cwd=tree, env=os.environ | {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"},
@@ -205,36 +186,44 @@ def run_module(tree: Path, module: str, words: Sequence[str]) -> tuple[int, str]
     )  # fmt: skip
     try:
         output = process.communicate(timeout=PATIENCE_S)[0]
-    except (subprocess.TimeoutExpired, KeyboardInterrupt) as error:
-        if isinstance(error, subprocess.TimeoutExpired):
-            process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=ENDING_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
-        if isinstance(error, KeyboardInterrupt):
-            raise
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(ENDING_S)
+        process.kill()
         raise RunError(f"{tree}: {module} has not ended after {PATIENCE_S:g} s") from None
-    return process.returncode, output
+    if process.returncode:
+        last = " / ".join(output.strip().splitlines()[-3:])
+        raise RunError(f"{tree}: {module} ended with {process.returncode}: {last}")
+    return output
 
 
 def finish(flags: AgainstFlags, rows: Sequence[Row], note: str, console: Console) -> int:
     """Print and write the rows; return the exit code, with --strict that of a missed target."""
     columns: dict[str, list[Any]] = {
         "": [row.what for row in rows],
-        "here": [cell(row.value, row.unit) for row in rows],
+        "here": [_cell(row.value, row.unit) for row in rows],
     }
     if flags.against is None:
         spreads = (() if row.spread is None else map(digits, row.spread) for row in rows)
         columns["least .. most"] = [" .. ".join(spread) for spread in spreads]
     else:
-        columns[flags.against] = [cell(row.other, row.unit) for row in rows]
+        columns[flags.against] = [_cell(row.other, row.unit) for row in rows]
         columns["ratio"] = ["" if row.ratio is None else f"{row.ratio:.2f}" for row in rows]
-    columns["target"] = [row.marked_target() for row in rows]
+    columns["target"] = [
+        "" if row.target is None else marked(
+            "{} {:g} {}", ">=" if row.unit == "x" else "<=", row.target,
+            Text("ok", "green") if row.ok else Text("missed", "yellow"),
+        )
+        for row in rows
+    ]  # fmt: skip
     print_table(console, columns, note)
     write_rows(flags.json, [row._asdict() for row in rows])
     return FAULT_EXIT_CODE if flags.strict and not all(row.ok for row in rows) else 0
+
+
+def _cell(value: float | None, unit: str) -> str:
+    return "" if value is None else f"{digits(value)} {unit}"
 
 
 def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], note: str) -> None:
@@ -246,11 +235,6 @@ def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], n
         shown.add_row(*row)
     console.print(shown)
     console.print(note, style="dim")
-
-
-def cell(value: float | None, unit: str = "") -> str:
-    """Return a figure with its unit."""
-    return "" if value is None else f"{digits(value)} {unit}".rstrip()
 
 
 def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:

@@ -42,13 +42,9 @@ class BodyStiffness(NamedTuple):
 def body_stiffness(
     *, mass: float, height: float, half_sole: float, tau_max: float
 ) -> BodyStiffness:
-    """Return the least body stiffness that balances.
+    """Return the least body stiffness that balances a mass, kg, with its COM at a height, m.
 
-    Args:
-        mass: that leans, kg.
-        height: of its COM above the ankles, m.
-        half_sole: from the ankle to the sole's edge in this direction, m.
-        tau_max: of one ankle, N m.
+    `half_sole`, m, reaches from the ankle to the sole's edge; `tau_max`, N m, is of one ankle.
     """
     weight_moment = mass * GRAVITY * height
     sine = 2.0 * tau_max / weight_moment

@@ -149,11 +149,7 @@ def nodes_of(
 ) -> list[StiffnessNode]:
     """Return the reachable poses, linearised, without and with the full assist.
 
-    Args:
-        config: the robot.
-        D_at: returns the local stiffness (12,), N m/rad, at a COM height (m) and a pitch (rad).
-        heights: of the COM, m.
-        pitches: of the torso, rad.
+    `D_at` returns the local stiffness (12,), N m/rad, at a COM height, m, and a pitch, rad.
     """
     poses, inertia = Poses(config), BodyInertia(config)
     nodes = []

@@ -41,11 +41,7 @@ optimize, transform = late("scipy.optimize"), late("scipy.spatial.transform")
 
 FRICTION: Final = 0.5
 """Friction coefficient of the soles on a slippery floor."""
-DIRECTIONS: Final = {
-    "forwards": (1.0, 0.0),
-    "back": (-1.0, 0.0),
-    "sideways": (0.0, 1.0),
-}
+DIRECTIONS: Final = {"forwards": (1.0, 0.0), "back": (-1.0, 0.0), "sideways": (0.0, 1.0)}
 """World x and y of each push. Left and right are symmetric."""
 RIGID: Final = 1e9
 """N/m; an integral leaves no error."""
@@ -182,19 +178,12 @@ class LoadedStand:
         return self._hardest(response, np.zeros(2 * N_JOINTS))
 
     def limit_led(
-        self,
-        D: Array,
-        direction: tuple[float, float],
-        K_c: Array,
-        integral_max: float,
+        self, D: Array, direction: tuple[float, float], K_c: Array, integral_max: float
     ) -> PushLimit:
         """Return the hardest push that gains and integral hold, which grew slowly.
 
-        Args:
-            D: local stiffnesses (12,), N m/rad.
-            direction: world x and y, a unit vector.
-            K_c: stiffness that the planner adds along p (6, 6).
-            integral_max: of F_I, N; 0: there is none (`services.planner.law.coupling`).
+        Arguments as for `response`; `integral_max` is of F_I, N; 0: there is none
+        (`services.planner.law.coupling`).
         """
         rigid = np.zeros((6, 6))
         rigid[Y, Y] = RIGID
@@ -226,16 +215,9 @@ class LoadedStand:
     def limit_of_body(self, direction: Sequence[float], limp: str = "") -> PushLimit:
         """Return the hardest push that soles and motors bear at this pose under any control.
 
-        Args:
-            direction: world x and y, a unit vector; or a wrench on the torso (6,), N and N m: the
-                limit is then in times of it.
-            limp: a module whose motors have no torque.
-
-        Raises:
-            ValueError: no module is called so.
+        The direction is world x and y, a unit vector; or a wrench on the torso (6,), N and N m: the
+        limit is then in times of it. The motors of the module `limp` have no torque.
         """
-        if limp and limp not in MODULES:
-            raise ValueError(f"no module is called {limp!r}: {', '.join(MODULES)}")
         total, unit = self._W[0] + self._W[1], np.pad(direction, (0, 6 - len(direction)))
 
         def loads(x: Array) -> Array:

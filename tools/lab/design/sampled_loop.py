@@ -221,11 +221,7 @@ class _Step(NamedTuple):
         """Return the map of so many steps."""
         total, by_u, by_f = np.eye(len(self.F)), np.zeros_like(self.G), np.zeros_like(self.G_f)
         for _ in range(times):
-            total, by_u, by_f = (
-                self.F @ total,
-                self.F @ by_u + self.G,
-                self.F @ by_f + self.G_f,
-            )
+            total, by_u, by_f = (self.F @ total, self.F @ by_u + self.G, self.F @ by_f + self.G_f)
         return _Step(total, by_u, by_f)
 
 

@@ -77,15 +77,9 @@ def torque_breakdown(
 ) -> TorqueBreakdown:
     """Return the breakdown of a tick.
 
-    Args:
-        config: the robot.
-        q: measured joint angles (12,), rad.
-        v: measured joint rates (12,), rad/s.
-        q_ref: references (12,), rad.
-        v_ref: rates of the references (12,), rad/s.
-        assist: assist force in the feedforward, N.
-        slope: floor slope along x and y that the planner used, rad.
-        stance: the right foot relative to the left that the planner used, m and rad.
+    Joint angles and their references (12,) are in rad, rates in rad/s. Assist, N, the floor's slope
+    along x and y, rad, and the stance (right foot relative to the left, m and rad) are those that
+    the planner used.
 
     Raises:
         ConfigError: the gain split needs a schedule, and the robot's is missing or stale.

@@ -21,6 +21,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Kill, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
+from shared.state import copied
 from tools.lab.studies.sweeps.figures import NOBODY, sole_tilt_max_rad
 from tools.logs.hand_path import HandRow
 from tools.logs.reexecution.compare import ReexecutionResult
@@ -90,7 +91,7 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
     for name in MODULES:
         joint = JointExecution(robot, name, ReexecutionResult(name, 0.0, exact=False))
         rows = ((message.t_ns, joint) for _, message in joint.run(log))
-        for moment, snapshot in _at(found, rows, _copy):
+        for moment, snapshot in _at(found, rows, lambda execution: copied(execution.snapshot())):
             if snapshot is not None:
                 moment.modules[name] = snapshot
     planner = PlannerExecution(robot, ReexecutionResult("planner", 0.0, exact=False))
@@ -102,14 +103,6 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
     for moment, margin in _at(found, published, lambda status: status.margin):
         moment.margin = margin
     return found
-
-
-def _copy(execution: JointExecution) -> DriveManagerState | None:
-    """Return a copy of a service's present state: its own keeps changing."""
-    snapshot = execution.snapshot()
-    if snapshot is None:
-        return None
-    return msgspec.json.decode(msgspec.json.encode(snapshot), type=DriveManagerState)
 
 
 def _at(

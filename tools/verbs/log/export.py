@@ -25,7 +25,6 @@ BAG_RATE_HZ: Final = 100.0
 EXAMPLES: Final = """
 xrl log export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
 xrl log export out/a/run.mcap --gif shove.gif --from 5 --to 9
-xrl log export out/a/run.mcap --gif fig7.gif --curves     # with curves, as the paper's Fig. 7
 xrl log export out/a --csv tables                         # a file for each topic and module
 xrl log export out/a --csv t --rate 100 --topic 'joint/*/state' --topic harness/wrench
 xrl log export out/a --ros2bag bag                        # ros2 bag play bag
@@ -38,8 +37,6 @@ class ExportFlags(PartFlags):
     file: Annotated[Path, positional("FILE", help=f"{RUN_HELP}; it is not touched")]
     gif: Path | None = None
     """draw the robot from the side and the front, as an animated picture"""
-    curves: bool = False
-    """with --gif: add curves of COM, height and hand"""
     csv: Folder | None = None
     """write CSV tables: a file for each key, with all of its messages"""
     topic: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
@@ -67,8 +64,6 @@ class ExportFlags(PartFlags):
             raise RunError("--topic chooses what is in tables: add --csv DIR")
         if self.rate is not None and self.csv is None and self.ros2bag is None:
             raise RunError("--rate is that of tables or a bag: add --csv or --ros2bag")
-        if self.curves and self.gif is None:
-            raise RunError("--curves go beside a picture: name it with --gif FILE")
 
 
 def run(flags: ExportFlags) -> int:
@@ -82,7 +77,7 @@ def run(flags: ExportFlags) -> int:
     console = Console()
     if flags.gif is not None:
         refuse_taken(flags.gif, path, force=flags.force)
-        _draw(read_part(index, part), flags.gif, console, with_curves=flags.curves)
+        _draw(read_part(index, part), flags.gif, console)
     if flags.csv is not None:
         _write_tables(index, part, flags, flags.csv, console)
     if flags.ros2bag is not None:
@@ -128,15 +123,12 @@ def _write_bag(
     console.print(marked("[bold]{}[/]: {}", out, told), soft_wrap=True)
 
 
-def _draw(log: RunLog, out: Path, console: Console, *, with_curves: bool) -> None:
+def _draw(log: RunLog, out: Path, console: Console) -> None:
     """Draw the run's moving picture, with progress."""
     require("plot")
     from tools.judge.reports.moving_picture import write_gif  # noqa: PLC0415 - needs the extra
 
     with Progress(console=console, transient=True) as shown:
         bar = shown.add_task("drawing", total=1.0)
-        count = write_gif(
-            log, robot_of(log), out, lambda part: shown.update(bar, completed=part),
-            with_curves=with_curves,
-        )  # fmt: skip
+        count = write_gif(log, robot_of(log), out, lambda part: shown.update(bar, completed=part))
     console.print(marked("[bold]{}[/]: {} frames", out, count), soft_wrap=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image, ImageColor
+from PIL import Image
 
 from shared.bus.messages import Mode
 from shared.config.robot_config import RobotConfig
@@ -14,15 +14,7 @@ from shared.joints import SIDES
 from shared.robot.robot_model import ankle_positions
 from tests.tools.judge.reports.runs import Made
 from tools import cli
-from tools.judge.reports.moving_picture import (
-    FRAMES_S,
-    HAND_INK,
-    MODE_INK,
-    RIGHT,
-    SIZE,
-    WIDTH,
-    world_frames,
-)
+from tools.judge.reports.moving_picture import FRAMES_S, MODE_INK, SIZE, world_frames
 from tools.judge.reports.robot_pose import poses
 from tools.logs.run_log import RunLog
 
@@ -48,22 +40,6 @@ def test_the_picture_is_as_long_as_the_scenario(drawn: Path) -> None:
         assert picture.n_frames / FRAMES_S == pytest.approx(4.0, abs=0.2)
 
 
-def test_curves_grow_beside_it_until_they_are_whole(made: Made, tmp_path: Path) -> None:
-    """The height's curve has ink farther right in each later frame, up to its panel's end."""
-    out = tmp_path / "fig7.gif"
-    assert cli.main(["log", "export", str(made.path), "--gif", str(out), "--curves"]) == 0
-    ends = []
-    with Image.open(out) as picture:
-        assert picture.size == (SIZE[0] + WIDTH, SIZE[1])
-        for number in (5, picture.n_frames // 2, picture.n_frames - 1):
-            picture.seek(number)
-            pixels = np.asarray(picture.convert("RGB"))[:, SIZE[0] :]
-            inked = np.all(pixels == ImageColor.getrgb(HAND_INK), axis=2)
-            ends.append(int(np.flatnonzero(inked[180:].any(axis=0)).max()))
-    assert ends[0] < ends[1] < ends[2]
-    assert ends[2] == pytest.approx(WIDTH - RIGHT, abs=4)
-
-
 def test_modules_change_their_colour_from_track_to_hold_when_the_planner_dies(drawn: Path) -> None:
     seen = []
     with Image.open(drawn) as picture:
@@ -73,10 +49,3 @@ def test_modules_change_their_colour_from_track_to_hold_when_the_planner_dies(dr
             seen.append({"#{:02x}{:02x}{:02x}".format(*pixel) for pixel in pixels.reshape(-1, 3)})
     assert [MODE_INK[Mode.TRACK] in inks for inks in seen] == [True, False]
     assert [MODE_INK[Mode.HOLD] in inks for inks in seen] == [False, True]
-
-
-def test_a_picture_that_exists_is_not_replaced_unasked(
-    drawn: Path, made: Made, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["log", "export", str(made.path), "--gif", str(drawn)]) == 2
-    assert "exists already" in capsys.readouterr().err

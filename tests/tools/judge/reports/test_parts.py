@@ -51,10 +51,6 @@ def test_the_timeline_is_that_of_the_whole(page: str, in_parts: str) -> None:
     assert parts == whole
 
 
-def test_the_messages_counted_are_those_of_the_whole(page: str, in_parts: str) -> None:
-    assert section(in_parts, "lost") == section(page, "lost")
-
-
 def test_panels_and_lines_are_those_of_the_whole(page: str, in_parts: str) -> None:
     whole, parts = runs.data_of(page), runs.data_of(in_parts)
     assert [panel["title"] for panel in parts["panels"]] == [

@@ -263,11 +263,7 @@ def _joint_target(
 
 
 def advance(
-    loop: Loop,
-    states: Array,
-    coupling: float = 1.0,
-    torque: float = 1.0,
-    micro_step: float = 25e-6,
+    loop: Loop, states: Array, coupling: float = 1.0, torque: float = 1.0, micro_step: float = 25e-6
 ) -> Array:
     """Step discrete states, one per column, through one planner period.
 

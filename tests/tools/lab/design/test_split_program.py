@@ -14,7 +14,7 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.robot.robot_model import stand_pose
 from tests.planner.states import Stand, at_pose, com_height, shipped_ik
-from tools.lab.design import design_program, split_program
+from tools.lab.design import split_program
 from tools.lab.design.dynamic_certificate import TRACK, DynamicCertificate
 
 SOLVED = 1e-3
@@ -174,7 +174,7 @@ def test_the_shipped_damping_meets_the_dynamic_certificate_everywhere(robot: Rob
     """Every pose, drivetrain, hand and delay of [robustness], with 6 dB and twice the delay."""
     assert robot.gain_schedule is not None
     nodes = split_program.dynamic_nodes(robot, robot.gain_schedule)
-    design_program.check(robot, nodes, split_program.design_of(robot.gain_schedule))
+    split_program.check_design(robot, nodes, split_program.design_of(robot.gain_schedule))
 
 
 def test_damping_that_shakes_the_rotors_is_refused_with_the_case(robot: RobotConfig) -> None:
@@ -182,20 +182,20 @@ def test_damping_that_shakes_the_rotors_is_refused_with_the_case(robot: RobotCon
     nodes = split_program.dynamic_nodes(robot, robot.gain_schedule)[:2]
     stiff = split_program.design_of(robot.gain_schedule)._replace(D_B=(150.0,) * 6)
     with pytest.raises(RunError, match=r"COM 0\.\d+ m.*grows by"):
-        design_program.check(robot, nodes, stiff)
+        split_program.check_design(robot, nodes, stiff)
 
 
 def test_the_search_starts_from_what_is_stable_and_ends_cheaper(
     robot: RobotConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert robot.gain_schedule is not None
-    monkeypatch.setattr(design_program, "ROUNDS", 1)
+    monkeypatch.setattr(split_program, "ROUNDS", 1)
     wanted = msgspec.structs.replace(
         robot.robustness, stiffness=(8000.0,), hands=robot.robustness.hands[:1]
     )
     easier = msgspec.structs.replace(robot, robustness=wanted)
     nodes = split_program.dynamic_nodes(robot, robot.gain_schedule)
     few = DynamicCertificate(easier, nodes[4:5])
-    found = design_program._descend(few, design_program.START, lambda _text: None)
+    found = split_program._descend(few, split_program.START, lambda _text: None)
     assert few.worst(found, TRACK).stable
-    assert design_program._cost(few, found) < design_program._cost(few, design_program.START)
+    assert split_program._cost(few, found) < split_program._cost(few, split_program.START)

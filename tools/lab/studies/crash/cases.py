@@ -51,7 +51,7 @@ CRASHED: Final = tuple(name for name in SERVICES if name not in ("simulator", *O
 
 
 class CrashVerdict(StrEnum):
-    """How a case came out."""
+    """How a case came out, the best first."""
 
     STOOD = "stood"
     SANK = "sank"
@@ -59,11 +59,6 @@ class CrashVerdict(StrEnum):
     FELL = "fell"
     UNJUDGED = "unjudged"
     """The run could not be carried out to where it can be judged."""
-
-    @property
-    def badness(self) -> int:
-        """0 is best."""
-        return list(CrashVerdict).index(self)
 
 
 class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
@@ -209,16 +204,13 @@ def _lost(service: str, signal: str) -> CrashCase:
     )
 
 
-def _is_overspeed_after_a_gap(module: str) -> bool:
-    """Return True for a knee: it moves on the way down, and its count jumps at the gap's end."""
-    return kind_of(module) == "knee"
-
-
 def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCase:
     """Return the case of one drive's fault."""
     name: str = kind
     expected = CrashVerdict.STOOD
-    if kind == "encoder_gap" and not _is_overspeed_after_a_gap(module):
+    # a knee moves on the way down: its count jumps at the gap's end, which is an overspeed
+    hardly_moves = kind == "encoder_gap" and kind_of(module) != "knee"
+    if hardly_moves:
         why = "the joint hardly moves meanwhile: the drive holds through it"
     elif not DRIVE_FAULTS[kind].limp and kind != "encoder_gap":
         name = "unplugged" if kind == "link_lost" else kind
@@ -232,7 +224,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCa
         crash=(fault(module, kind),),
         expected=expected,
         why=why,
-        holds=kind != "bus_full" and (kind != "encoder_gap" or _is_overspeed_after_a_gap(module)),
+        holds=kind != "bus_full" and not hardly_moves,
         leads_again=not DRIVE_FAULTS[kind].zero_lost,
         quick=quick,
     )
@@ -285,10 +277,7 @@ CASES: Final[Sequence[CrashCase]] = (
     _pair("planner-harness", *killed("planner", "harness"), why=_NEITHER),
     _pair("planner-recorder", *killed("planner", "recorder"), why=_NEITHER),
     _pair(
-        "harness-recorder",
-        *killed("harness", "recorder"),
-        why="balance needs neither",
-        holds=False,
+        "harness-recorder", *killed("harness", "recorder"), why="balance needs neither", holds=False
     ),
     _pair("stopped-planner-knee", *killed("planner", signal="STOP"), *killed("knee_left")),
     _pair("knee-unplugged-hip", *killed("knee_left"), fault("hip_right", "link_lost")),

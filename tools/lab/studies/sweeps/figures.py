@@ -1,26 +1,31 @@
-"""What the studies measure alike: which rows count, how a case ends, figures and their shares."""
+"""What the studies have in common: a run in virtual time, which rows count, endings, figures."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import StrEnum
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import msgspec
 
-from shared.bus.messages import JointEvent
+from services.simulator.physics.plant import PlantConfig
+from shared.bus.messages import JointEvent, Message
+from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import Scenario
 from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE
-from tools.judge.standing import is_tipping
+from shared.extras import late
+from tools.judge.standing import why_not_standing
 from tools.lab.studies.sweeps.table import Row
-from tools.sim.lockstep import Watch, forget
+from tools.sim.lockstep import Lockstep, Watch, forget
 from tools.sim.virtual_services import Record
 
+stats = late("scipy.stats")
+
 END_TOLERANCE_S: Final = 0.1
-Z_95: Final = 1.959964
-"""Two-sided 95 % of a normal distribution, in standard deviations."""
 
 
 class Observer(NamedTuple):
@@ -34,12 +39,7 @@ class Observer(NamedTuple):
     """How long the trial continues after a fall, at which measurement ends."""
 
     def rows_that_count(self, run: Iterable[SimTruth], from_s: float) -> Iterator[SimTruth]:
-        """Run to the end or to the fall; yield what counts of it, a fall included.
-
-        Args:
-            run: the world, as a fleet in virtual time gives it.
-            from_s: scenario time from which on a row counts, s.
-        """
+        """Run to the end or to the fall; yield the rows from a scenario time on, and a fall."""
         fell_at_s: float | None = None
         for row in run:
             self.watch(row)
@@ -52,6 +52,83 @@ class Observer(NamedTuple):
 
 
 NOBODY: Final = Observer()
+
+
+class Case(Protocol):
+    """A drawn case: everything that decides its run, beside the robot."""
+
+    @property
+    def number(self) -> int:
+        """Its number, from 0 on."""
+
+    def scenario(self, robot: RobotConfig) -> Scenario:
+        """Return what happens."""
+
+    def true_plant(self) -> PlantConfig:
+        """Return the simulated robot."""
+
+
+class CaseRun(NamedTuple):
+    """What counts of a run: all until its end or the fall."""
+
+    rows: Sequence[SimTruth]
+    events: Sequence[tuple[str, JointEvent]]
+    """Changes of mode with their modules."""
+    messages: Sequence[tuple[str, Message]]
+    """Messages of the kinds that were asked for, with their modules."""
+
+    @property
+    def began(self) -> bool:
+        """False if the scenario never began: the robot fell before, or the modules never track."""
+        return bool(self.rows) and self.rows[0].scenario_s >= 0.0
+
+    def ended(self, end_s: float, robot: RobotConfig) -> dict[str, Any]:
+        """Return the figures of `Ended` of a case that ends at a scenario time, s."""
+        if not self.rows:
+            return {"ending": Ending.UNREADY}
+        last = self.rows[-1]
+        fell_at_s = last.scenario_s if last.fallen and self.began else None
+        return {"ending": ending_of(last, end_s, robot), "fell_at_s": fell_at_s}
+
+
+def run_fleet(
+    case: Case,
+    robot: RobotConfig,
+    observer: Observer,
+    network: Impairment,
+    *,
+    seed: int,
+    from_s: float = 0.0,
+    kept: tuple[type[Message], ...] = (),
+    fleet_type: type[Lockstep] = Lockstep,
+    each: Callable[[Lockstep, SimTruth], None] = lambda _fleet, _row: None,
+) -> CaseRun:
+    """Run a case in virtual time to its end or to the fall.
+
+    Rows count from the scenario time `from_s` on. The network is that of every link, beside the
+    scenario's own impairments. Messages of the kinds `kept` are kept. `each` is called with every
+    row, before the observer.
+    """
+    messages: list[tuple[str, Message]] = []
+
+    def record(topic: Topic, module: str, message: Message) -> None:
+        if isinstance(message, kept):
+            messages.append((module, message))
+        observer.record(topic, module, message)
+
+    def watch(row: SimTruth) -> None:
+        each(fleet, row)
+        observer.watch(row)
+
+    scenario, plant = case.scenario(robot), case.true_plant()
+    fleet = fleet_type(robot, scenario, network, seed=seed, record=record, plant=plant)
+    rows = list(observer._replace(watch=watch).rows_that_count(fleet.run(), from_s))
+    end_ns = rows[-1].t_ns if rows else 0
+    return CaseRun(
+        rows,
+        [row for row in fleet.events if row[1].t_ns <= end_ns],
+        [row for row in messages if row[1].t_ns < end_ns],
+    )
 
 
 class Ending(StrEnum):
@@ -96,7 +173,7 @@ def ending_of(last: SimTruth, end_s: float, robot: RobotConfig) -> Ending:
     """Return how a case came out that ends at a scenario time, by the last row that counts."""
     if last.fallen or last.scenario_s < end_s - END_TOLERANCE_S:
         return Ending.FELL
-    return Ending.TIPPING if is_tipping(last, robot) else Ending.STOOD
+    return Ending.TIPPING if why_not_standing(last, robot) else Ending.STOOD
 
 
 def com_max_mm(rows: Sequence[SimTruth]) -> float:
@@ -112,12 +189,6 @@ def operator_peak_n(rows: Sequence[SimTruth]) -> float:
 def sole_tilt_max_rad(rows: Sequence[SimTruth]) -> float:
     """Return the largest tilt of a sole, rad."""
     return max(max(row.foot_right_tilt, row.foot_left_tilt) for row in rows)
-
-
-def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
-    """Return the robot with another payload, kg; its gain schedule may then be stale."""
-    mass = msgspec.structs.replace(robot.mass, payload=payload)
-    return msgspec.structs.replace(robot, mass=mass)
 
 
 def scalars(case: msgspec.Struct) -> dict[str, object]:
@@ -139,16 +210,11 @@ def event_steps_nm(events: Iterable[JointEvent]) -> list[float]:
 def wilson(hits: int, of: int) -> tuple[float, float]:
     """Return the 95 % interval of a share that was seen in some trials (E. B. Wilson, 1927).
 
-    It holds for one share: of several intervals, the worst is missed more often than once in 20.
-
-    Args:
-        hits: how often it was so.
-        of: trials, independent of each other; at least 1.
+    The trials are independent of each other. It holds for one share: of several intervals, the
+    worst is missed more often than once in 20.
     """
-    share, z2 = hits / of, Z_95 * Z_95
-    middle = (share + z2 / (2 * of)) / (1.0 + z2 / of)
-    half = Z_95 / (1.0 + z2 / of) * math.sqrt(share * (1.0 - share) / of + z2 / (4 * of * of))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    interval = stats.binomtest(hits, of).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def parted(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:

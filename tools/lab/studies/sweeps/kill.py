@@ -15,9 +15,7 @@ import msgspec
 import numpy as np
 
 from services.simulator.physics.plant import PlantConfig
-from services.simulator.physics.world import World
-from shared.bus.messages import JointEvent, Message, Mode, PlannerStatus, RunEvent, RunEventKind
-from shared.bus.topics import Topic
+from shared.bus.messages import JointEvent, PlannerStatus, RunEvent, RunEventKind
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_MS
 from shared.config import gain_schedule
@@ -26,24 +24,25 @@ from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.extras import require
-from shared.joints import MODULES, SIDES
+from shared.joints import MODULES
 from shared.robot.robot_model import stand_pose
 from tools.flags import Count
+from tools.fleet.stalls import goes_to_hold
 from tools.lab.design import split_program
 from tools.lab.studies.sweeps import plants, pool, study
 from tools.lab.studies.sweeps.figures import (
     NOBODY,
+    CaseRun,
     Ended,
     Ending,
     Observer,
     com_max_mm,
-    ending_of,
     event_steps_nm,
     operator_peak_n,
     parted,
+    run_fleet,
     scalars,
     sole_tilt_max_rad,
-    with_payload,
 )
 from tools.lab.studies.sweeps.plants import DIGITS, SHARE, PushFlags, PushRange, uniform
 from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun, bar
@@ -52,7 +51,6 @@ from tools.live import experiment
 from tools.live.experiment import LawFlags
 from tools.output import Picture, new_figure
 from tools.sim.lockstep import Lockstep
-from tools.sim.virtual_services import Record
 from tools.terminal import Console
 
 PAYLOADS: Final = 5
@@ -80,6 +78,7 @@ PUSH_SHARE: Final = (0.1, 1.0)
 """Shares of the hardest push that is drawn (`PushRange`)."""
 PUSH_S: Final = 0.3
 PUSHES_MAX: Final = 3
+PUSH_COLUMNS: Final = ("at_s", "x_n", "y_n")
 POSES_MAX: Final = 2
 AFTER_KILL_S: Final = 3.0
 AFTER_PUSH_S: Final = 1.7
@@ -89,22 +88,14 @@ operator who leads on against a robot that holds tips it slowly."""
 DELAY_MAX_MS: Final = 20.0
 
 
-class LeadPose(msgspec.Struct, frozen=True):
-    """Where the operator leads."""
-
-    height_m: float
-    pitch_rad: float
-    assist_n: float
-
-
 class KillCase(msgspec.Struct, frozen=True, kw_only=True):
     """A drawn case. SI units; times are the scenario's."""
 
     number: int
     seed: int
     payload_kg: float
-    poses: tuple[LeadPose, ...]
-    """One or two, led to one after the other from standing."""
+    way: tuple[Keyframe, ...]
+    """Standing, then one or two poses that the operator leads to."""
     pace: float
     moving: bool
     """True: killed on the way to the last pose; False: after it has been reached."""
@@ -124,18 +115,13 @@ class KillCase(msgspec.Struct, frozen=True, kw_only=True):
             quiet.append(self.way_end_s + AFTER_LEAD_S)
         return max([self.kill_s + AFTER_KILL_S, *quiet])
 
-    def scenario(self, robot: RobotConfig) -> Scenario:
+    def scenario(self, _robot: RobotConfig) -> Scenario:
         """Return the case as a scenario; the hand that lets go is not in it."""
-        frames = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
-        for pose, (_, end) in zip(self.poses, _legs(robot, self.poses, self.pace), strict=True):
-            frames.append(
-                Keyframe(at=end, height=pose.height_m, pitch=pose.pitch_rad, assist=pose.assist_n)
-            )
         return Scenario(
             name=f"kill-{self.seed}-{self.number}",
             about=f"case {self.number} of `xrl study kill --seed {self.seed}`",
             duration=self.end_s,
-            keyframe=tuple(frames),
+            keyframe=self.way,
             kill=(Kill(service="planner", at=self.kill_s),),
             push=self.pushes,
         )
@@ -151,6 +137,12 @@ def payloads(robot: RobotConfig) -> tuple[float, ...]:
     return tuple(round(highest * i / (PAYLOADS - 1), DIGITS) for i in range(PAYLOADS))
 
 
+def with_payload(robot: RobotConfig, payload: float) -> RobotConfig:
+    """Return the robot with another payload, kg; its gain schedule may then be stale."""
+    mass = msgspec.structs.replace(robot.mass, payload=payload)
+    return msgspec.structs.replace(robot, mass=mass)
+
+
 class KillCases:
     """The cases of a robot."""
 
@@ -164,9 +156,10 @@ class KillCases:
         dice = random.Random(f"kill {seed} {number}")
         payload = dice.choice(payloads(self._robot))
         loaded, pushes = self._of(payload)
-        poses = tuple(_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX))))
+        poses = [_draw_pose(dice, loaded) for _ in range(dice.choice((1, 1, POSES_MAX)))]
         pace = uniform(dice, *PACE)
-        begin, end = _legs(self._robot, poses, pace)[-1]
+        way = _way(self._robot, poses, pace)
+        begin, end = way[-2].at, way[-1].at
         moving = dice.random() < 0.5
         kill = uniform(dice, *((begin, end) if moving else (end + STILL_S[0], end + STILL_S[1])))
         hand_off = dice.random() < 0.5
@@ -178,7 +171,7 @@ class KillCases:
             number=number,
             seed=seed,
             payload_kg=payload,
-            poses=poses,
+            way=way,
             pace=pace,
             moving=moving,
             way_end_s=end,
@@ -195,8 +188,8 @@ class KillCases:
         return self._by_payload[payload]
 
 
-def _draw_pose(dice: random.Random, robot: RobotConfig) -> LeadPose:
-    """Draw a posture that the legs reach, and the weight rested on it in half of the cases."""
+def _draw_pose(dice: random.Random, robot: RobotConfig) -> tuple[float, float, float]:
+    """Draw height and pitch that the legs reach, and in half of the cases a weight on them."""
     while True:
         upright = dice.random() < 0.5
         height = uniform(dice, *(HEIGHT_UPRIGHT if upright else HEIGHT))
@@ -204,7 +197,7 @@ def _draw_pose(dice: random.Random, robot: RobotConfig) -> LeadPose:
         if reachable(robot, height, pitch):
             break
     resting = dice.random() < 0.5
-    return LeadPose(height, pitch, uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0)
+    return height, pitch, uniform(dice, 0.0, robot.assist.force_max) if resting else 0.0
 
 
 def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> list[Push]:
@@ -234,32 +227,33 @@ def reachable(robot: RobotConfig, height: float, pitch: float) -> bool:
     )
 
 
-def _legs(
-    robot: RobotConfig, poses: tuple[LeadPose, ...], pace: float
-) -> list[tuple[float, float]]:
-    """Return when the way to each pose begins and ends, s."""
-    legs, t = [], START_S
-    before = LeadPose(robot.simulation.stand_height, 0.0, 0.0)
+def _way(
+    robot: RobotConfig, poses: Sequence[tuple[float, float, float]], pace: float
+) -> tuple[Keyframe, ...]:
+    """Return the way from standing to each pose of height, pitch and assist."""
+    way = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
     for pose in poses:
-        ways = zip(msgspec.structs.astuple(before), msgspec.structs.astuple(pose), strict=True)
-        times = [abs(b - a) / speed for (a, b), speed in zip(ways, SPEED, strict=True)]
-        legs.append((t, round(t + max(LEG_MIN_S, max(times) / pace), DIGITS)))
-        before, t = pose, legs[-1][1]
-    return legs
+        last = way[-1]
+        before = last.height, last.pitch, last.assist
+        times = [abs(b - a) / speed for a, b, speed in zip(before, pose, SPEED, strict=True)]
+        at = round(last.at + max(LEG_MIN_S, max(times) / pace), DIGITS)
+        way.append(Keyframe(at, pose[0], pitch=pose[1], assist=pose[2]))
+    return tuple(way)
 
 
 def row_of(case: KillCase) -> dict[str, object]:
     """Return every draw by its column; None where there was no such draw."""
     row = scalars(case) | {"moving": int(case.moving)}
-    for index in range(POSES_MAX):
-        pose = case.poses[index] if index < len(case.poses) else None
-        for key in LeadPose.__struct_fields__:
-            row[f"pose{index + 1}_{key}"] = getattr(pose, key, None)
+    units = {"height": "m", "pitch": "rad", "assist": "n"}
+    for index in range(1, POSES_MAX + 1):
+        pose = case.way[index] if index < len(case.way) else None
+        row |= {f"pose{index}_{key}_{unit}": getattr(pose, key, None)
+                for key, unit in units.items()}  # fmt: skip
     for index in range(PUSHES_MAX):
         push = case.pushes[index] if index < len(case.pushes) else None
-        row[f"push{index + 1}_at_s"] = push.at if push else None
-        row[f"push{index + 1}_x_n"] = push.force[0] if push else None
-        row[f"push{index + 1}_y_n"] = push.force[1] if push else None
+        values = (push.at, *push.force[:2]) if push else (None,) * 3
+        names = (f"push{index + 1}_{name}" for name in PUSH_COLUMNS)
+        row |= dict(zip(names, values, strict=True))
     return row
 
 
@@ -299,117 +293,48 @@ class KillResult(Ended, frozen=True, kw_only=True):
     """Largest distance of an ankle from its first place, mm."""
 
 
-class KillRecorder:
-    """Collects from the messages what the verdict needs, and passes all of them on."""
-
-    def __init__(self, on_to: Record) -> None:
-        self._on_to = on_to
-        self.kill_ns: int | None = None
-        self.status: PlannerStatus | None = None
-        """The planner's last."""
-        self.fallen = False
-        """From then on nothing counts."""
-
-    def __call__(self, topic: Topic, module: str, message: Message) -> None:
-        """Take a message as the bus would."""
-        if isinstance(message, PlannerStatus) and not self.fallen:
-            self.status = message
-        elif isinstance(message, RunEvent) and message.kind == RunEventKind.KILLED:
-            self.kill_ns = message.t_ns
-        self._on_to(topic, module, message)
-
-
 def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) -> KillResult:
     """Run a case to its end or to the fall, and measure it.
 
     The robot has the case's payload and a gain schedule that fits (`robots_of`).
     """
-    monitor = KillRecorder(observer.record)
-    fleet = Lockstep(
-        robot,
-        case.scenario(robot),
-        Impairment(delay_ms=case.delay_ms),
-        seed=case.number,
-        record=monitor,
-        plant=case.true_plant(),
-    )
-    feet = FootLoads(fleet.world)
-    rows: list[SimTruth] = []
-    loads: list[float] = []
 
-    def let_go_in_time(row: SimTruth) -> None:
+    def let_go_in_time(fleet: Lockstep, row: SimTruth) -> None:
         if case.let_go_s is not None and row.scenario_s >= case.let_go_s:
             fleet.world.let_go()
-        observer.watch(row)
 
-    for row in observer._replace(watch=let_go_in_time).rows_that_count(fleet.run(), 0.0):
-        rows.append(row)
-        monitor.fallen = row.fallen
-        loads.append(min(feet.read()))
-    return measure(case, rows, loads, fleet.events, monitor, robot)
-
-
-class FootLoads:
-    """The normal force under each foot."""
-
-    def __init__(self, world: World) -> None:
-        """Find the soles."""
-        self._data = world.data
-        self._soles = [world.model.geom(f"sole_{side}").id for side in SIDES]
-
-    def read(self) -> tuple[float, float]:
-        """Return (right, left), N.
-
-        With the model's elliptic friction cones a contact's first constraint force is its
-        normal force.
-        """
-        contact, force = self._data.contact, self._data.efc_force
-        loads = [0.0, 0.0]
-        for (a, b), address in zip(contact.geom, contact.efc_address, strict=True):
-            for foot, sole in enumerate(self._soles):
-                if sole in (a, b) and address >= 0:
-                    loads[foot] += float(force[address])
-        return loads[0], loads[1]
+    network = Impairment(delay_ms=case.delay_ms)
+    run = run_fleet(
+        case, robot, observer, network, seed=case.number, kept=(PlannerStatus, RunEvent),
+        each=let_go_in_time,
+    )  # fmt: skip
+    return measure(case, run, robot)
 
 
-def measure(
-    case: KillCase,
-    rows: list[SimTruth],
-    loads: list[float],
-    events: list[tuple[str, JointEvent]],
-    monitor: KillRecorder,
-    robot: RobotConfig,
-) -> KillResult:
-    """Return the figures of a run, by the world since it began and all messages.
-
-    `loads` has for each row the load of the lighter foot, N.
-    """
-    if not rows or rows[0].scenario_s < 0.0:
-        return KillResult(ending=Ending.FELL if rows else Ending.UNREADY)
-    last = rows[-1]
-    events = [row for row in events if row[1].t_ns <= last.t_ns]
+def measure(case: KillCase, run: CaseRun, robot: RobotConfig) -> KillResult:
+    """Return the figures of a run."""
+    rows, events, _ = run
+    figures = run.ended(case.end_s, robot)
+    if not run.began:
+        return KillResult(**figures)
     before = [row for row in rows if row.scenario_s < case.kill_s]
-    figures: dict[str, float] = {}
     if before:
         figures["operator_peak_before_n"] = operator_peak_n(before)
         figures["com_before_max_mm"] = com_max_mm(before)
+    killed = [m.t_ns for _, m in run.messages
+              if isinstance(m, RunEvent) and m.kind == RunEventKind.KILLED]  # fmt: skip
     after = [row for row in rows if row.scenario_s >= case.kill_s]
-    if after and monitor.kill_ns is not None:
-        figures |= _after(after) | _handover(events, monitor.kill_ns)
-        figures["foot_load_min_n"] = min(loads[-len(after) :])
-    if monitor.status is not None:
-        figures["kill_margin"] = monitor.status.margin
-        figures["kill_margin_onboard"] = monitor.status.margin_onboard
-    until_ns = monitor.kill_ns if monitor.kill_ns is not None else last.t_ns
-    return KillResult(
-        ending=ending_of(last, case.end_s, robot),
-        fell_at_s=last.scenario_s if last.fallen else None,
-        holds_before=_drop_outs(events, rows[0].t_ns, until_ns),
-        **figures,
-    )
+    if after and killed:
+        figures |= _after(after) | _handover(events, killed[0])
+    statuses = [message for _, message in run.messages if isinstance(message, PlannerStatus)]
+    if statuses:
+        figures["kill_margin"] = statuses[-1].margin
+        figures["kill_margin_onboard"] = statuses[-1].margin_onboard
+    until_ns = killed[0] if killed else rows[-1].t_ns
+    return KillResult(holds_before=_drop_outs(events, rows[0].t_ns, until_ns), **figures)
 
 
-def _after(rows: list[SimTruth]) -> dict[str, float]:
+def _after(rows: Sequence[SimTruth]) -> dict[str, float]:
     x, y = 1e3 * np.array([row.over for row in rows]).T
     return {
         "kill_height_m": rows[0].torso[2],
@@ -419,6 +344,9 @@ def _after(rows: list[SimTruth]) -> dict[str, float]:
         "com_y_min_mm": float(y.min()),
         "com_y_max_mm": float(y.max()),
         "com_max_mm": com_max_mm(rows),
+        "foot_load_min_n": min(
+            min(row.foot_right_force[2], row.foot_left_force[2]) for row in rows
+        ),
         "roll_max_rad": max(abs(row.angles[0]) for row in rows),
         "yaw_max_rad": max(abs(row.angles[2]) for row in rows),
         "sole_tilt_max_rad": sole_tilt_max_rad(rows),
@@ -426,25 +354,21 @@ def _after(rows: list[SimTruth]) -> dict[str, float]:
     }
 
 
-def _drop_outs(events: list[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> int:
+def _drop_outs(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> int:
     count = dict.fromkeys(MODULES, 0)
     for module, event in events:
-        count[module] += from_ns <= event.t_ns < to_ns and _into_hold(event)
+        count[module] += from_ns <= event.t_ns < to_ns and goes_to_hold(event)
     return max(count.values())
 
 
-def _handover(events: list[tuple[str, JointEvent]], kill_ns: int) -> dict[str, float]:
-    late = {m: e for m, e in reversed(events) if e.t_ns >= kill_ns and _into_hold(e)}
+def _handover(events: Sequence[tuple[str, JointEvent]], kill_ns: int) -> dict[str, float]:
+    late = {m: e for m, e in reversed(events) if e.t_ns >= kill_ns and goes_to_hold(e)}
     figures = {}
     if len(late) == len(MODULES):
         figures["hold_ms"] = max(event.t_ns - kill_ns for event in late.values()) / NS_PER_MS
     if late:
         figures["torque_step_nm"] = max(event_steps_nm(late.values()))
     return figures
-
-
-def _into_hold(event: JointEvent) -> bool:
-    return event.mode_before == Mode.TRACK and event.mode_after == Mode.HOLD
 
 
 def robots_of(
@@ -460,7 +384,8 @@ def robots_of(
     """
     weights = sorted({case.payload_kg for case in cases})
     ready = {weight: with_payload(robot, weight) for weight in weights}
-    tasks = [weight for weight in weights if needs_schedule(ready[weight])]
+    certified = robot.law.split == "certified"
+    tasks = [weight for weight in weights if certified and gain_schedule.why_stale(ready[weight])]
     if tasks:
         require("design")
         solved = pool.results(
@@ -476,11 +401,6 @@ def robots_of(
                 ready[loaded.mass.payload] = made
                 shown.update(line, advance=1)
     return [ready[case.payload_kg] for case in cases]
-
-
-def needs_schedule(robot: RobotConfig) -> bool:
-    """Return True if the robot's gain split uses a schedule and its own does not fit."""
-    return robot.law.split == "certified" and bool(gain_schedule.why_stale(robot))
 
 
 def _solve(robot: RobotConfig) -> GainSchedule:
@@ -540,8 +460,7 @@ def describe(row: Row) -> str:
 
 def _pushes(row: Row) -> list[tuple[float, float, float]]:
     """Return time, x and y of each push of a row."""
-    columns = ("at_s", "x_n", "y_n")
-    found = [[row[f"push{i}_{name}"] for name in columns] for i in range(1, PUSHES_MAX + 1)]
+    found = [[row[f"push{i}_{name}"] for name in PUSH_COLUMNS] for i in range(1, PUSHES_MAX + 1)]
     return [(at, x, y) for at, x, y in found if at is not None]
 
 

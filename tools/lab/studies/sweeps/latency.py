@@ -11,40 +11,38 @@ from __future__ import annotations
 import argparse
 import math
 import random
-import re
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import product
+from itertools import pairwise, product
 from statistics import median
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
 from rich.table import Table
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import JointEvent, JointState, Message, Mode, Pair, RunEvent, RunEventKind
-from shared.bus.topics import Topic
-from shared.bus.traces import SimTruth
+from shared.bus.messages import JointEvent, JointState, Mode, RunEvent, RunEventKind
 from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Scenario
+from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.toml_file import check_ranges
-from tools.flags import Arg, Count, Number, parsed
+from tools.flags import Arg, Count, Number, names_of, parsed
 from tools.lab.studies.sweeps import plants, study
 from tools.lab.studies.sweeps.figures import (
     EXIT_CODES,
     NOBODY,
+    CaseRun,
     Ended,
-    Ending,
     Observer,
     com_max_mm,
-    ending_of,
     event_steps_nm,
     operator_peak_n,
     parted,
+    run_fleet,
     sole_tilt_max_rad,
     step_nm,
     wilson,
@@ -56,7 +54,6 @@ from tools.live import experiment
 from tools.output import Picture, new_figure
 from tools.sim.centralised import CentralisedLockstep
 from tools.sim.lockstep import Lockstep
-from tools.sim.virtual_services import Record
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
 """s, and m below the stand: as in the paper's Fig. 7, at its pace."""
@@ -70,26 +67,31 @@ PUSHED_UNTIL_S: Final = 5.3
 """The pushes come over the bad network, one in each third of the time, at random."""
 
 
-class ControlKind(msgspec.Struct, frozen=True):
+class ControlKind(NamedTuple):
     """One way to control the robot."""
 
     about: str
     fleet: type[Lockstep]
-    split: str | None = None
+    split: str | None
     """`law.split`; None: as the robot file has it."""
+    colour: str
+    marker: str
 
 
 CONTROLS: Final = {
     "distributed": ControlKind(
-        "as shipped: local gains certified, the rest by the planner", Lockstep
+        "as shipped: local gains certified, the rest by the planner",
+        Lockstep, None, "#1b7f4b", "o",
     ),
-    "diagonal": ControlKind("the paper's local gains, diag(K_q)", Lockstep, "diagonal"),
+    "diagonal": ControlKind(
+        "the paper's local gains, diag(K_q)", Lockstep, "diagonal", "#c77700", "s"
+    ),
     "centralised": ControlKind(
         "every torque by the planner, and nothing below it: gains not retuned for the delay, no "
         "damping on the drives, the last torques kept when no new ones come, overload ignored",
-        CentralisedLockstep,
+        CentralisedLockstep, None, "#7b3fa0", "^",
     ),
-}
+}  # fmt: skip
 """By name."""
 
 
@@ -103,22 +105,13 @@ class Network(msgspec.Struct, frozen=True):
     """Share of the messages."""
 
 
-class Shove(NamedTuple):
-    """A push that is drawn."""
-
-    at: float
-    """s"""
-    share: float
-    """1 is what soles and motors bear along its direction (`PushRange`)."""
-    angle: float
-    """rad from x (forwards) to y (left)."""
-
-
-class Draw(msgspec.Struct, frozen=True):
+class Draw(NamedTuple):
     """Random draws of a trial."""
 
     impaired_from_s: float
-    shoves: tuple[Shove, ...]
+    shoves: tuple[tuple[float, float, float], ...]
+    """Pushes: time, s; share of what soles and motors bear along their direction (`PushRange`);
+    angle, rad from x (forwards) to y (left)."""
     fleet_seed: int
     """Seed of losses, jitter and the harness sensor's noise."""
 
@@ -143,7 +136,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
         shoves = []
         for index in range(PUSHES):
             at = begin + index * third + dice.uniform(0.0, third - PUSH_S)
-            shoves.append(Shove(at, dice.uniform(*PUSH_SHARE), dice.uniform(-math.pi, math.pi)))
+            shoves.append((at, dice.uniform(*PUSH_SHARE), dice.uniform(-math.pi, math.pi)))
         return Draw(begin, tuple(shoves), dice.getrandbits(48))
 
     def scenario(self, robot: RobotConfig) -> Scenario:
@@ -208,84 +201,49 @@ def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
     return msgspec.structs.replace(robot, law=msgspec.structs.replace(robot.law, split=split))
 
 
-class LatencyRecorder:
-    """Collects from the messages what the figures need, and passes all of them on."""
-
-    def __init__(self, on_to: Record, impaired_from_s: float) -> None:
-        self._on_to = on_to
-        self._tau: dict[str, Pair] = {}
-        self._after_ns = round(impaired_from_s * NS_PER_S)
-        self.from_ns: int | None = None
-        """Time at which the network is impaired; None before the scenario has started."""
-        self.fallen = False
-        """From then on nothing counts."""
-        self.torque_step = 0.0
-        """As `LatencyResult.torque_step_nm`."""
-
-    def __call__(self, topic: Topic, module: str, message: Message) -> None:
-        """Take a message as the bus would."""
-        if isinstance(message, JointState):
-            if self.from_ns is not None and message.t_ns >= self.from_ns and not self.fallen:
-                step = step_nm(self._tau[module], message.tau)
-                self.torque_step = max(self.torque_step, step)
-            self._tau[module] = message.tau
-        elif isinstance(message, RunEvent) and message.kind == RunEventKind.STARTED:
-            self.from_ns = message.t_ns + self._after_ns
-        self._on_to(topic, module, message)
-
-
-def fleet_of(trial: LatencyTrial, robot: RobotConfig, record: Record) -> Lockstep:
-    """Return the fleet of a trial, before its first step."""
-    return CONTROLS[trial.control].fleet(
-        robot_of(robot, trial.control),
-        trial.scenario(robot),
-        Impairment(),
-        seed=trial.draw.fleet_seed,
-        record=record,
-        plant=trial.true_plant(),
-    )
-
-
 def run_trial(
     trial: LatencyTrial, robot: RobotConfig, observer: Observer = NOBODY
 ) -> LatencyResult:
     """Run a trial to its end or to the fall, and measure it."""
-    impaired_from_s = trial.draw.impaired_from_s
-    monitor = LatencyRecorder(observer.record, impaired_from_s)
-    fleet = fleet_of(trial, robot, monitor)
-    rows: list[SimTruth] = []
-    for row in observer.rows_that_count(fleet.run(), impaired_from_s):
-        rows.append(row)
-        monitor.fallen = row.fallen
-    return measure(rows, fleet.events, monitor, robot)
-
-
-def measure(
-    rows: Sequence[SimTruth],
-    events: Sequence[tuple[str, JointEvent]],
-    monitor: LatencyRecorder,
-    robot: RobotConfig,
-) -> LatencyResult:
-    """Return the figures of a run, by the world since the impairment began and all messages."""
-    if not rows or monitor.from_ns is None:
-        return LatencyResult(ending=Ending.FELL if rows else Ending.UNREADY)
-    last = rows[-1]
-    hand = np.array([row.operator_force[2] for row in rows])
-    within = [(m, e) for m, e in events if monitor.from_ns <= e.t_ns <= last.t_ns]
-    since = [(m, e) for m, e in within if e.mode_after in (Mode.HOLD, Mode.TRACK)]
-    into_hold = [m for m, e in since if e.mode_after == Mode.HOLD]
+    draw = trial.draw
+    run = run_fleet(
+        trial, robot_of(robot, trial.control), observer, Impairment(), seed=draw.fleet_seed,
+        from_s=draw.impaired_from_s, kept=(JointState, RunEvent),
+        fleet_type=CONTROLS[trial.control].fleet,
+    )  # fmt: skip
+    if not run.began:
+        return LatencyResult(**run.ended(DURATION_S, robot))
+    started = (m for _, m in run.messages if isinstance(m, RunEvent))
+    from_ns = next(m.t_ns for m in started if m.kind == RunEventKind.STARTED)
+    from_ns += round(draw.impaired_from_s * NS_PER_S)
+    hand = np.array([row.operator_force[2] for row in run.rows])
+    since = [
+        (module, event)
+        for module, event in run.events
+        if event.t_ns >= from_ns and event.mode_after in (Mode.HOLD, Mode.TRACK)
+    ]
+    into_hold = [module for module, event in since if event.mode_after == Mode.HOLD]
     return LatencyResult(
-        ending=ending_of(last, DURATION_S, robot),
-        fell_at_s=last.scenario_s if last.fallen else None,
-        operator_peak_n=operator_peak_n(rows),
+        **run.ended(DURATION_S, robot),
+        operator_peak_n=operator_peak_n(run.rows),
         operator_rms_n=float(np.sqrt(np.mean(hand * hand))),
-        com_max_mm=com_max_mm(rows),
-        hold_share=hold_share(events, monitor.from_ns, last.t_ns),
+        com_max_mm=com_max_mm(run.rows),
+        hold_share=hold_share(run.events, from_ns, run.rows[-1].t_ns),
         holds=max(into_hold.count(module) for module in MODULES),
-        torque_step_nm=monitor.torque_step,
+        torque_step_nm=_torque_step_nm(run, from_ns),
         hold_step_nm=max(event_steps_nm(event for _, event in since), default=0.0),
-        sole_tilt_max_rad=sole_tilt_max_rad(rows),
+        sole_tilt_max_rad=sole_tilt_max_rad(run.rows),
     )
+
+
+def _torque_step_nm(run: CaseRun, from_ns: int) -> float:
+    """Return `LatencyResult.torque_step_nm`."""
+    largest = 0.0
+    for module in MODULES:
+        states = [m for name, m in run.messages if name == module and isinstance(m, JointState)]
+        steps = (step_nm(a.tau, b.tau) for a, b in pairwise(states) if b.t_ns >= from_ns)
+        largest = max(largest, max(steps, default=0.0))
+    return largest
 
 
 def hold_share(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> float:
@@ -311,51 +269,32 @@ def hold_share(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: in
 DELAYS_MS: Final = "0,10,20,30,50,100,200"
 LOSSES: Final = "0,0.1,0.3,0.5"
 DELAY_MAX_MS: Final = 60_000.0
-VALUES_MAX: Final = 1000
 
 
-def values_in(low: float, high: float) -> Callable[[str], tuple[float, ...]]:
-    """Return a reader for argparse: `0,10,50:200:50` as numbers, rising, none twice."""
+def values_up_to(high: float) -> Callable[[str], tuple[float, ...]]:
+    """Return a reader for argparse: `0,10,50` as numbers, rising, none twice."""
 
     def read(text: str) -> tuple[float, ...]:
-        number = r"(\d+(?:\.\d*)?|\.\d+)"
-        found: set[float] = set()
-        for piece in text.split(","):
-            match = re.fullmatch(rf"{number}(?::{number}:{number})?", piece.strip())
-            if match is None:
-                raise argparse.ArgumentTypeError(
-                    f"{text!r}; write numbers such as 0,10,50, or FROM:TO:STEP such as 0:200:10"
-                )
-            first = float(match[1])
-            last, step = (float(match[2]), float(match[3])) if match[2] else (first, 1.0)
-            if last < first or step <= 0.0 or (last - first) / step > VALUES_MAX:
-                raise argparse.ArgumentTypeError(
-                    f"{piece!r}: FROM:TO:STEP must rise, in at most {VALUES_MAX} steps"
-                )
-            steps = int((last - first) / step + 1e-9)
-            found.update(round(first + i * step, DECIMALS) for i in range(steps + 1))
-        if max(found) > high or min(found) < low:
-            raise argparse.ArgumentTypeError(f"{text!r}: must be from {low:g} to {high:g}")
+        try:
+            found = {round(float(word), DECIMALS) for word in text.split(",")}
+        except ValueError:
+            found = {math.nan}
+        if not all(0.0 <= value <= high for value in found):
+            raise argparse.ArgumentTypeError(
+                f"{text!r}: write numbers from 0 to {high:g} with commas, such as 0,0.5"
+            )
         return tuple(sorted(found))
 
     return read
 
 
-def parse_controls(text: str) -> tuple[str, ...]:
-    """Read names with commas, for argparse."""
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
-    if unknown := [name for name in names if name not in CONTROLS]:
-        raise argparse.ArgumentTypeError(f"{unknown[0]!r}; some of {', '.join(CONTROLS)}")
-    return tuple(name for name in CONTROLS if name in names)
-
-
-_DELAYS: Final = values_in(0.0, DELAY_MAX_MS)
-_SHARES: Final = values_in(0.0, 1.0)
+_DELAYS: Final = values_up_to(DELAY_MAX_MS)
+_SHARES: Final = values_up_to(1.0)
 
 EXAMPLES: Final = """
 xrl study latency
-xrl study latency --delay 0:200:10 --jitter 5 --loss 0,0.2 --n 10 --out out/latency
-xrl study latency --control distributed --delay 0:60:5 --loss 0 --lead-easing 0
+xrl study latency --delay 0,50,150 --jitter 5 --loss 0,0.2 --n 10 --out out/latency
+xrl study latency --control distributed --delay 0,30,60 --loss 0 --lead-easing 0
 xrl study latency --only 137 --out out/trial137
 xrl study latency --cluster tcp://HOST:8786
 """
@@ -368,7 +307,7 @@ class LatencyStudyFlags(StudyFlags):
         tuple[float, ...],
         parsed(
             _DELAYS, "MS", is_one=True,
-            help="delay of every link, each way: numbers and A:B:STEP, with commas "
+            help="delay of every link, each way; several with commas "
             f"(default: {DELAYS_MS})",
         ),
     ] = _DELAYS(DELAYS_MS)  # fmt: skip
@@ -387,13 +326,19 @@ class LatencyStudyFlags(StudyFlags):
     control: Annotated[
         tuple[str, ...],
         parsed(
-            parse_controls, "NAME,...", is_one=True,
+            names_of(CONTROLS), "NAME,...", is_one=True,
             help="which to compare (default: all): "
             + "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items()),
         ),
     ] = tuple(CONTROLS)  # fmt: skip
     lead_easing: Annotated[Number | None, Arg(metavar="ALPHA")] = None
     """law.lead_easing, for all controls"""
+
+    def check(self) -> None:
+        """Refuse a comparison of nothing."""
+        super().check()
+        if not self.control:
+            raise RunError(f"--control: name at least one of {', '.join(CONTROLS)}")
 
 
 def load(flags: LatencyStudyFlags) -> RobotConfig:
@@ -421,14 +366,6 @@ def trial_of(grid: Sequence[tuple[Network, str]], seed: int, number: int) -> Lat
     repeat, place = divmod(number, len(grid))
     network, control = grid[place]
     return LatencyTrial(number=number, repeat=repeat, seed=seed, control=control, network=network)
-
-
-STYLES: Final = {
-    "distributed": ("#1b7f4b", "o"),
-    "diagonal": ("#c77700", "s"),
-    "centralised": ("#7b3fa0", "^"),
-}
-"""Colour and marker of a control."""
 
 
 class Cell(NamedTuple):
@@ -506,15 +443,15 @@ def draw(finished: StudyRun) -> Picture:
     falls, effort = figure.subplots(2, 1, sharex=True)
     delays = sorted({delay for _, delay in cells})
     for name in dict.fromkeys(control for control, _ in cells):
-        colour, marker = STYLES[name]
+        style: dict[str, Any] = {"color": CONTROLS[name].colour, "marker": CONTROLS[name].marker}
         own = [(x, cells[name, d]) for x, d in enumerate(delays) if (name, d) in cells]
         places = [x for x, _ in own]
         shares = np.array([100 * cell.fallen / cell.of for _, cell in own])
         low, high = 100 * np.transpose([wilson(cell.fallen, cell.of) for _, cell in own])
         spread = np.maximum(0.0, (shares - low, high - shares))
-        falls.errorbar(places, shares, spread, color=colour, marker=marker, capsize=3, label=name)
+        falls.errorbar(places, shares, spread, capsize=3, label=name, **style)
         peaks = [cell.operator_peak_n for _, cell in own]
-        effort.plot(places, peaks, color=colour, marker=marker)
+        effort.plot(places, peaks, **style)
     falls.set(ylabel="falls in %, 95 % (Wilson)", ylim=(-3.0, 103.0))
     falls.legend()
     effort.set(ylabel="hand's peak force in N, median", xlabel="delay each way in ms, not to scale")

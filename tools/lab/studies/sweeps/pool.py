@@ -15,13 +15,13 @@ import os
 import select
 import signal
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 from threading import Lock, Thread
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from shared.exceptions import FAULT_EXIT_CODE, RunError, os_error_in_words
 from shared.extras import late, require
@@ -45,14 +45,6 @@ CODE: Final = ("services", "shared", "tools/lab", "tools/sim")
 _one_at_a_time: Final = Lock()
 """A worker with several threads runs one case after the other: CasADi builds its graphs in one
 thread only."""
-
-
-class _Done(NamedTuple):
-    """Result of one task, or its error in words."""
-
-    number: int
-    result: Any
-    error: str = ""
 
 
 def cores() -> int:
@@ -80,23 +72,18 @@ def results(
 ) -> Iterator[tuple[T, R]]:
     """Yield each task with its result as it is done, in no order.
 
-    Leaving the loop early, by an exception or by `close`, ends the rest at once.
-
-    Args:
-        work: a function of a module; it runs in the workers.
-        tasks: its arguments, one after the other.
-        workers: processes of this machine; 1: this process.
-        name: returns a task's name for an error.
-        cluster: address of a Dask scheduler, whose workers then run the tasks.
+    Leaving the loop early, by an exception or by `close`, ends the rest at once. `work` is a
+    function of a module, `name` returns a task's name for an error. One worker is this process.
+    With the address of a Dask scheduler its workers run the tasks.
 
     Raises:
         RunError: no worker can be started or reached, the work failed on a task, a worker died, or
             a cluster's worker has other code.
     """
-    run = partial(_run, work, "" if cluster is None else code_digest())
+    digest = "" if cluster is None else code_digest()
+    calls = [(work, digest, number, task, name(task)) for number, task in enumerate(tasks)]
     if workers == 1 and cluster is None:
-        outputs = (run(number, task) for number, task in enumerate(tasks))
-        yield from _unpacked(outputs, tasks, name)
+        yield from ((task, _run(*call)[1]) for task, call in zip(tasks, calls, strict=True))
         return
     lost = "a worker process was killed (out of memory?); it may need fewer --workers"
     if cluster is not None:
@@ -106,9 +93,9 @@ def results(
                                    batch_size=1, return_as="generator_unordered")  # fmt: skip
         try:
             warnings.filterwarnings("ignore", module="joblib")  # that cancelled tasks are lost
-            calls = (joblib.delayed(run)(number, task) for number, task in enumerate(tasks))
-            with closing(parallel(calls)) as outputs:
-                yield from _unpacked(outputs, tasks, name)
+            with closing(parallel(joblib.delayed(_run)(*call) for call in calls)) as outputs:
+                for number, result in outputs:
+                    yield tasks[number], result
         except (BrokenProcessPool, CancelledError):
             raise RunError(lost) from None
         except TimeoutError:
@@ -118,25 +105,16 @@ def results(
             ) from None
 
 
-def _unpacked(
-    outputs: Iterable[_Done], tasks: Sequence[T], name: Callable[[T], str]
-) -> Iterator[tuple[T, Any]]:
-    for done in outputs:
-        if done.error:
-            raise RunError(f"{name(tasks[done.number])}: {done.error}")
-        yield tasks[done.number], done.result
-
-
-def _run(work: Callable[[T], R], digest: str, number: int, task: T) -> _Done:
+def _run(work: Callable[[T], R], digest: str, number: int, task: T, name: str) -> tuple[int, R]:
     """Do the work in a worker; `digest` is that of the study's code, if the code may differ."""
     if digest not in ("", code_digest()):
-        return _Done(number, None, "a worker of the cluster has other code; install the same")
+        raise RunError(f"{name}: a worker of the cluster has other code; install the same")
     try:
         with _one_at_a_time:
-            return _Done(number, work(task))
+            return number, work(task)
     except Exception as error:  # noqa: BLE001 - the study reports it with the task's name
         words = " ".join(str(error).split())
-        return _Done(number, None, f"{type(error).__name__}: {words}")
+        raise RunError(f"{name}: {type(error).__name__}: {words}") from None
 
 
 @contextmanager

@@ -27,10 +27,10 @@ from tools.lab.studies.sweeps.figures import (
     Ending,
     Observer,
     com_max_mm,
-    ending_of,
     event_steps_nm,
     operator_peak_n,
     parted,
+    run_fleet,
     scalars,
     sole_tilt_max_rad,
 )
@@ -40,7 +40,6 @@ from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import ImuFlags
 from tools.output import Picture, new_figure
-from tools.sim.lockstep import Lockstep
 
 if TYPE_CHECKING:
     from scipy import stats
@@ -142,28 +141,19 @@ def draw(
 
 def run_trial(trial: RobustTrial, robot: RobotConfig, observer: Observer = NOBODY) -> RobustResult:
     """Run a trial to its end or to the fall, and measure it."""
-    fleet = Lockstep(
-        robot,
-        trial.scenario(robot),
-        Impairment(delay_ms=trial.delay_ms),
-        seed=trial.number,
-        record=observer.record,
-        plant=trial.true_plant(),
-    )
-    rows = list(observer.rows_that_count(fleet.run(), 0.0))
-    if not rows or rows[0].scenario_s < 0.0:
-        return RobustResult(ending=Ending.FELL if rows else Ending.UNREADY)
-    last = rows[-1]
-    led = [row for row in rows if row.scenario_s < trial.kill_s]
-    held = [row for row in rows if row.scenario_s >= trial.kill_s]
-    events = [event for _, event in fleet.events if rows[0].t_ns <= event.t_ns <= last.t_ns]
+    network, end_s = Impairment(delay_ms=trial.delay_ms), trial.scenario(robot).duration
+    run = run_fleet(trial, robot, observer, network, seed=trial.number)
+    if not run.began:
+        return RobustResult(**run.ended(end_s, robot))
+    led = [row for row in run.rows if row.scenario_s < trial.kill_s]
+    held = [row for row in run.rows if row.scenario_s >= trial.kill_s]
+    events = [event for _, event in run.events if run.rows[0].t_ns <= event.t_ns]
     return RobustResult(
-        ending=ending_of(last, fleet.scenario.duration, robot),
-        fell_at_s=last.scenario_s if last.fallen else None,
+        **run.ended(end_s, robot),
         operator_peak_n=operator_peak_n(led),
         com_led_max_mm=com_max_mm(led),
         com_held_max_mm=com_max_mm(held) if held else None,
-        sole_tilt_max_rad=sole_tilt_max_rad(rows),
+        sole_tilt_max_rad=sole_tilt_max_rad(run.rows),
         hold_step_nm=max(event_steps_nm(events), default=None),
     )
 

@@ -11,24 +11,24 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Generic, NamedTuple, Protocol, TypeVar
+from typing import Annotated, Any, Final, Generic, NamedTuple, TypeVar
 
 import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from services.simulator.physics.plant import PlantConfig
 from shared.bus.traces import SimTruth
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Scenario
 from shared.exceptions import RunError
 from shared.extras import require
 from shared.places import DEFAULT_CONFIG
 from tools.flags import Arg, ConfigFlags, Count, Folder, Natural, fields_of
+from tools.judge.figure import judge_run
 from tools.lab.studies.sweeps import plants, pool
 from tools.lab.studies.sweeps.figures import (
     EXIT_CODES,
+    Case,
     Ending,
     Observer,
     parted,
@@ -39,27 +39,13 @@ from tools.lab.studies.sweeps.figures import (
 from tools.lab.studies.sweeps.table import CaseTable, Row, plain
 from tools.live import experiment
 from tools.output import Picture, save_figure
-from tools.sim.recorded_lockstep import AFTER_FALL_S, judge_in_lockstep, record_run
+from tools.sim.recorded_lockstep import AFTER_FALL_S, record_run
 from tools.terminal import Console, marked
 
 FALLS_SHOWN: Final = 10
 FALL_COLOUR: Final = "#c0392b"
 NOT_THE_STUDY: Final = ("n", "config", "seed", "only", "workers", "cluster", "out")
 """Flags that `command_of` leaves out, or writes apart."""
-
-
-class Case(Protocol):
-    """A drawn case: everything that decides its run, beside the robot."""
-
-    @property
-    def number(self) -> int:
-        """Its number, from 0 on."""
-
-    def scenario(self, robot: RobotConfig) -> Scenario:
-        """Return what happens."""
-
-    def true_plant(self) -> PlantConfig:
-        """Return the simulated robot."""
 
 
 C = TypeVar("C", bound=Case)
@@ -152,7 +138,7 @@ def run(study: Study[C], flags: Any) -> int:
     inputs = {
         "study": study.name,
         **{name: _text(getattr(flags, name)) for name in ("seed", *study.decided_by)},
-        "ranges": plants.digest(),
+        "ranges": hashlib.sha256(plants.RANGES_FILE.read_bytes()).hexdigest(),
         "robot": digest_of(robot),
         "code": pool.code_digest(),
     }
@@ -241,7 +227,7 @@ def _run_alone(study: Study[C], begun: StudyRun, case: C) -> int:
                 watch,
                 case.true_plant(),
             )
-            judge_in_lockstep(scenario, out)
+            judge_run(out, f"{scenario.name} in lockstep", scenario.duration)
     show("Measured", msgspec.structs.asdict(figures), console)
     if out is not None:
         console.print(f"{out}/run.mcap, run.png, summary.json", style="dim", soft_wrap=True)
@@ -306,10 +292,8 @@ def show_outcome(
 ) -> None:
     """Print the falls, the median and the worst figures of the others, and the share of falls.
 
-    Args:
-        finished: the study.
-        figures: column, words, unit, and the sign that is worse.
-        describe: returns a case in a line.
+    `figures` are column, words, unit, and the sign that is worse; `describe` returns a case in a
+    line.
     """
     rows, console, command = finished.rows, finished.console, finished.command
     standing, fallen = parted(rows)

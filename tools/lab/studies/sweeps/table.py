@@ -13,6 +13,7 @@ import io
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -40,11 +41,8 @@ class CaseTable:
     ) -> None:
         """Open a table, new or to resume; incomplete or damaged rows are left out.
 
-        Args:
-            path: of the CSV file; its folder is made if it is missing.
-            drawn: by case, the start of its row; the first column is the case's number.
-            figures: the rest of a row.
-            inputs: parameters of the rows, by name.
+        A row begins with what was drawn for its case, the case's number first, and ends with its
+        figures. `inputs` are parameters of all rows, by name.
 
         Raises:
             RunError: the folder cannot be used, another study is writing to it, or its parameters
@@ -152,14 +150,10 @@ class CaseTable:
         if lines and lines[0].split(",") != self._columns:
             raise RunError(f"{self._path}: has other columns; choose another --out")
         for line in lines[1:]:
-            cells = next(csv.reader([line]), [])
-            if len(cells) == len(self._columns) and cells[0].isdecimal():
-                row = dict(zip(self._columns, cells, strict=True))
-                try:
-                    self._typed(row)
-                except msgspec.ValidationError:
-                    continue
-                self._rows[int(cells[0])] = row
+            with suppress(ValueError, StopIteration):  # damaged
+                row = dict(zip(self._columns, next(csv.reader([line])), strict=True))
+                self._typed(row)
+                self._rows[int(row[self._columns[0]])] = row
 
     def _write(self) -> None:
         """Rewrite all rows atomically."""

