@@ -25,7 +25,6 @@ EXTRAS: Final = {
     "plot": _PLOT,
     "design": ("cvxpy", "scipy"),
     "view": ("aiohttp",),
-    "foxglove": ("foxglove",),
     "ros2": ("rosbags",),
     "usb": ("odrive",),
     "pad": ("sdl2", "sdl2dll"),

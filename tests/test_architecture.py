@@ -96,7 +96,6 @@ VENDORS = {
     ],
     "odrive": ["services/joint/drivers/odrive_usb.py", "tools/bringup/usb_board.py"],
     "mcap": ["shared/mcap_log/*.py", "tools/logs/reexecution/rewritten.py"],
-    "foxglove": ["tools/view/foxglove_server.py"],
     "supervisor": ["tools/fleet/*.py"],
     "can": [
         "shared/can/unix_can.py",
@@ -114,7 +113,6 @@ NEEDS_EXTRA = {
     "services/joint/drivers/odrive_usb.py": "usb",
     "tools/bringup/usb_board.py": "usb",
     "tools/view/server.py": "view",
-    "tools/view/foxglove_server.py": "foxglove",
     "tools/export/ros2_bag.py": "ros2",
     "tools/judge/reports/moving_picture.py": "plot",
 }

@@ -41,7 +41,6 @@ _ABROAD = {
     "erase_configuration",
     *("lowlatency", "wait_before_close"),  # Zenoh
     *("corrupt", "gemodel", "paretonormal"),  # netem
-    *("camera", "settings", "ts"),  # Foxglove
     *("x_limit_torque", "x_limit_torque__mutmut_3"),  # mutmut
     *("_ms", "_us", "_hz", "_degc"),  # endings of names
 }

@@ -30,7 +30,6 @@ from tools.verbs import doctor
         ("view", "view"),
         ("view OUT", "view"),
         ("view --sim", "sim"),
-        ("view --foxglove", "foxglove"),
         ("up --run-dir run --out o", "sim"),
         ("up --run-dir run --out o --no-sim --ros2", "ros2"),
         ("up --view", "view"),

@@ -12,8 +12,7 @@ from shared import places
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.extras import require
-from shared.process import StopFlag
-from tools.flags import Arg, Run, RunDirFlags, robot_file_of
+from tools.flags import Run, RunDirFlags, robot_file_of
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge.run_parts import PartFlags, read_asked
 from tools.live.experiment import load_robot
@@ -25,14 +24,13 @@ from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource, single_file
 from tools.view.serving import PortFlags, serve
-from tools.view.source import FOXGLOVE_PORT, HOST, PORT, Source
+from tools.view.source import Source
 
 EXAMPLES: Final = """
 xrl view                       # the running fleet, without touching it
 xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
 xrl view out/demo/run.mcap     # a record: play, pause, step, scrub
 xrl view out/demo/run.mcap --html run.html     # ... as one file that opens anywhere
-xrl view --foxglove            # the same for Foxglove: connect it to the printed address
 xrl view --sim                 # a robot in this process: lead it, push it, kill its planner
 """
 
@@ -47,13 +45,10 @@ class ViewFlags(PortFlags, PartFlags, RunDirFlags):
     """write the record into one HTML file that needs no server, and end"""
     act: bool = False
     """let the page act on the running fleet; for a real robot you type its name first"""
-    foxglove: Annotated[
-        bool, Arg(help=f"serve the frames to Foxglove instead of a page (port: {FOXGLOVE_PORT})")
-    ] = False
     config: Annotated[Path | None, robot_file_of("that of the record or of the fleet")] = None
 
     def check(self) -> None:
-        """Refuse what does not go with a record, with --sim or with Foxglove."""
+        """Refuse what does not go with a record or with --sim."""
         super().check()
         if self.sim and self.record is not None:
             raise RunError("a record and --sim do not go together; leave one out")
@@ -63,20 +58,15 @@ class ViewFlags(PortFlags, PartFlags, RunDirFlags):
             )
         if self.html is not None and self.record is None:
             raise RunError("--html is for a record: name one")
-        if self.html is None and self.foxglove and (self.record is not None or self.act):
-            raise RunError("--foxglove shows a fleet or --sim; Foxglove itself opens records")
 
 
 def run(flags: ViewFlags) -> int:
     """Serve until Ctrl-C."""
     if flags.sim:
         require("sim")
-    if flags.html is None and not flags.foxglove:
-        require("view", "write it as one page: --html FILE" if flags.record is not None else "")
     if flags.html is not None:
         return _write(flags, flags.html)
-    if flags.foxglove:
-        return _serve_foxglove(flags)
+    require("view", "write it as one page: --html FILE" if flags.record is not None else "")
     with _source(flags) as source:
         serve(source, flags.port)
     return 0
@@ -103,21 +93,6 @@ def _source(flags: ViewFlags) -> Iterator[Source]:
             yield live
         finally:
             live.disconnect()
-
-
-def _serve_foxglove(flags: ViewFlags) -> int:
-    """Serve until Ctrl-C."""
-    require("foxglove")
-    from tools.view.foxglove_server import FoxgloveServer  # noqa: PLC0415 - needs the extra
-
-    stop = StopFlag()
-    with _source(flags) as source:
-        port = FOXGLOVE_PORT if flags.port == PORT else flags.port
-        server = FoxgloveServer(source, port)
-        print(f"ws://{HOST}:{server.port}  (in Foxglove: open a connection; Ctrl-C ends it)")
-        sys.stdout.flush()
-        server.serve(lambda: bool(stop))
-    return 0
 
 
 def _write(flags: ViewFlags, out: Path) -> int:

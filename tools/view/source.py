@@ -21,8 +21,6 @@ COURSE_FRAMES: Final = 300
 """Frames of a record's course: a point for each pixel of a plot."""
 HOST: Final = "127.0.0.1"
 PORT: Final = 8417
-FOXGLOVE_PORT: Final = 8765
-"""That Foxglove offers."""
 FRAMES_S: Final = 30.0
 PAGE: Final = Path(__file__).parent / "page"
 UPLOT: Final = Path(__file__).parents[1] / "judge" / "reports" / "vendor" / "uplot"

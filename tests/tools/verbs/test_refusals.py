@@ -70,8 +70,6 @@ REFUSALS: Final = {
     "view LOG --sim": "a record and --sim do not go together",
     "view LOG --act": "--act is for the fleet that is up",
     "view --html x.html": "--html is for a record: name one",
-    "view LOG --foxglove": "--foxglove shows a fleet",
-    "view --foxglove --act": "--foxglove shows a fleet",
     "drive zero knee_left --at 0.1": "1 numbers; 2 are right; phi and theta in rad",
     "drive zero knee_left --at a,b": "number 1, 'a': one within",
     "drive zero knee_left --at 0,0": "knee_left: theta 0 rad is outside of -3 .. -0.2",
