@@ -273,11 +273,11 @@ def test_an_action_is_published_on_the_bus_and_shown_by_the_verb(
     rig: Proxied, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--run-dir", str(rig.run_dir)]
-    assert cli.main(["inject", "--link", "joints->planner", "--loss", "0.5", *words]) == 0
+    assert cli.main(["inject", "joints->planner loss=0.5", *words]) == 0
     rig.send(100)
     assert cli.main(["inject", "--list", *words]) == 0
     assert "loss=50%" in capsys.readouterr().out
-    assert cli.main(["inject", "--clear", *words]) == 0
+    assert cli.main(["inject", "--clear", "all", *words]) == 0
     assert "nothing is done" in capsys.readouterr().out
     rig.wait(lambda: len(rig.told) == 12)
     assert [event.active for event in rig.told] == [True] * 6 + [False] * 6

@@ -163,7 +163,7 @@ def tables(status: FleetStatus) -> Group:
 
 def _lines(status: FleetStatus) -> Iterator[str | Text]:
     red, yellow = " [bold red]{}[/]", " [bold yellow]{}[/]"
-    way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear"
+    way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear all"
     impaired = f" [bold yellow]impaired on purpose: {{}}[/] (xrl {way_out})"
     slow = f"in slow motion: the fleet's clock goes at {status.pace:g} of real time"
     sections: tuple[tuple[str, Iterable[str]], ...] = (

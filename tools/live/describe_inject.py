@@ -62,35 +62,23 @@ _FILE: Final = "--inject"
 
 def parse_inject(text: str) -> Inject:
     """Parse `LINK key=value ...` for argparse; without `at` it starts with the scenario."""
-    words = text.replace(",", " ").split()
-    link = words.pop(0) if words else ""
+    link, *words = text.replace(",", " ").split() or [""]
     try:
-        return make(link, _split(words))
+        return _made(link, _split(words))
     except ConfigError as error:
         said = f"{text!r}: {error.key}: {error.found}; {error.expected}"
         raise argparse.ArgumentTypeError(said) from None
 
 
-def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
-    """Return an impairment from its words, checked.
-
-    Args:
-        link: of `shared.links`.
-        words: each with its value as written: times with us, ms or s behind them (alone: ms, of
-            `at` and `for` s), shares with % (alone: 0 to 1); of a switch it is not looked at.
-        dash: what stands before a word where it was written, for errors.
-
-    Raises:
-        ConfigError: a value is not understood or out of its range, or they do not go together;
-            the key is the word.
-    """
-    check_link(link, dash)
+def _made(link: str, words: Mapping[str, str]) -> Inject:
+    """Return an impairment from its words, each with its value as written; errors name the word."""
+    check_link(link)
     fields: dict[str, Any] = {"link": link, "at": 0.0}
     for word, text in words.items():
         if word in NUMBERS:
-            fields[NUMBERS[word].field] = _number(word, text, dash)
+            fields[NUMBERS[word].field] = _number(word, text)
         elif word == DISTRIBUTION:
-            fields[word] = _distribution(text, dash)
+            fields[word] = _distribution(text)
         else:
             fields[word] = True
     inject = msgspec.convert(fields, Inject)
@@ -99,7 +87,7 @@ def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
     except ConfigError as error:
         word = next(word for word, number in NUMBERS.items() if number.field == error.key)
         found, right = f"{words[word]!r} is out of range", f"{error.expected}; {NUMBERS[word].like}"
-        raise ConfigError(_FILE, f"{dash}{word}", found, right) from None
+        raise ConfigError(_FILE, word, found, right) from None
     problem = inject.fault()
     if not problem and inject.describe() == "nothing":
         problem = "nothing is done to it; give a delay, a loss or another word"
@@ -109,10 +97,10 @@ def make(link: str, words: Mapping[str, str], dash: str = "") -> Inject:
     return inject
 
 
-def check_link(link: str, dash: str = "") -> None:
+def check_link(link: str) -> None:
     """Refuse an unknown link, and name the closest one."""
     try:
-        directions_of(link, _FILE, f"{dash}link")
+        directions_of(link, _FILE, "link")
     except ConfigError as error:
         near = _near(link, (*GROUPS, *DIRECTIONS))
         if link.endswith("-"):
@@ -139,19 +127,19 @@ def _near(word: str, known: Iterable[str]) -> str:
     return f"perhaps {near[0]!r}; " if near and near[0] != word else ""
 
 
-def _number(word: str, text: str, dash: str) -> float:
+def _number(word: str, text: str) -> float:
     _, units, like = NUMBERS[word]
     match = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d{1,3})?)([a-z%]*)", text)
     if match is None or match[2] not in units:
-        raise ConfigError(_FILE, f"{dash}{word}", f"{text!r} is not understood", like)
+        raise ConfigError(_FILE, word, f"{text!r} is not understood", like)
     return float(Decimal(match[1]) * Decimal(units[match[2]]))
 
 
-def _distribution(text: str, dash: str) -> str:
+def _distribution(text: str) -> str:
     known = get_args(Distribution)
     if text not in known:
         right = f"{_near(text, known)}one of {', '.join(known)}"
-        raise ConfigError(_FILE, f"{dash}{DISTRIBUTION}", repr(text), right)
+        raise ConfigError(_FILE, DISTRIBUTION, repr(text), right)
     return text
 
 

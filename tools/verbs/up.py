@@ -48,7 +48,7 @@ xrl up --scenario crawl --out out/crawl
 xrl up --view                                  # and lead it by hand, in a browser
 xrl up --ros2                                  # ROS 2 sees it: docs/ros2.md
 xrl up --ros2 --domain 7 --accept estop        # and may stop it
-xrl up --injectable                            # then: xrl inject --link ... --delay 30
+xrl up --injectable                            # then: xrl inject 'all delay=30'
 xrl up --config lab.toml --no-sim
 xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # one host's services
 xrl up --config lab.toml --no-sim --only hip_left,host_recorder         # with a record on this host

@@ -98,7 +98,10 @@ def test_a_number_is_the_same_in_each_of_its_units(
     word: str, texts: tuple[str, ...], value: float
 ) -> None:
     for text in texts:
-        inject = describe_inject.make("all", {"burst": "1", "delay": "1", word: text})
+        words = {"burst": "1", "delay": "1", word: text}
+        inject = describe_inject.parse_inject(
+            f"all {' '.join(f'{key}={one}' for key, one in words.items())}"
+        )
         assert getattr(inject, describe_inject.NUMBERS[word].field) == value
 
 
