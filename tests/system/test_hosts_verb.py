@@ -152,12 +152,6 @@ def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     assert place.xrl("update") == 3
     assert "`xrl hosts down` first" in " ".join(capsys.readouterr().out.split())
 
-    assert place.xrl("records", "-o", str(place.base / "so far")) == 2
-    assert "--while-up" in capsys.readouterr().err
-    assert place.xrl("records", "--while-up", "-o", str(place.base / "so far")) == 0
-    (so_far,) = (place.base / "so far" / "body").iterdir()
-    assert read_run(so_far).count(topics.PLANNER_STATUS.key("xrl"))
-
     before = procfs.fleet_pids(place.run_dir("right"))
     place.cut_power("left", ear)
     ear.wait_for(Mode.TRACK, 60.0)
@@ -179,11 +173,9 @@ def lead_through(place: Place, ear: FleetEar, capsys: Any) -> None:
     assert not ear.fell
     assert place.xrl("down", "--limp") == 0
 
-    out = place.base / "records"
-    assert place.xrl("records", "-o", str(out)) == 0
-    assert [len(list((out / host).glob("*/run.mcap"))) for host in NAMES] == [1, 1, 3]
-    (fleets,) = (out / "body").iterdir()
-    log = read_run(fleets)
+    records = [list(place.base.glob(f"{host}/var/lib/xrl/out/*/run.mcap")) for host in NAMES]
+    assert [len(found) for found in records] == [1, 1, 3], "one for each start"
+    log = read_run(records[0][0])
     for module in MODULES:
         modes = [event.mode_after for event in log.messages(topics.JOINT_EVENT, module)]
         assert modes[-1] == Mode.DAMP, "to the end"

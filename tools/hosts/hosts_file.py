@@ -15,7 +15,6 @@ from shared.joints import MODULES, SIDES, side_of
 from shared.toml_file import Range, Section, read_toml
 
 _TOOLS: Final = (OPERATOR, VIEWER)
-_IPV4_BITS: Final = 32
 
 
 class Host(Section, frozen=True):
@@ -34,13 +33,6 @@ class Host(Section, frozen=True):
     record: bool = True
     """Where the recorder is another host's: keep a record of this one's services here. It is a
     reader like any tool: without the key of one there is none."""
-
-    private: tuple[str, ...] = ()
-    """CAN interfaces that only the services reach, in a network namespace of their own."""
-    nic: str = ""
-    """With `private`: interface of the robot's network, on which the services have `address`."""
-    prefix: Annotated[int, Range(1, 127, "1")] = 24
-    """With `private`: length of the network's part of `address`; 64 as a rule for IPv6."""
 
     @property
     def processes(self) -> tuple[str, ...]:
@@ -123,7 +115,6 @@ def _of_host(host: Host, before: tuple[Host, ...], known: tuple[str, ...]) -> Pr
             yield key, f"{value!r} stands twice", "one each"
     if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
         yield "processors", f"{host.processors!r}", "as systemd takes them: 0-1,3"
-    yield from _of_private_network(host)
     if not host.services:
         yield "services", "none", "at least one"
     for service in host.services:
@@ -135,29 +126,6 @@ def _of_host(host: Host, before: tuple[Host, ...], known: tuple[str, ...]) -> Pr
     for tool in host.tools:
         if tool not in _TOOLS:
             yield "tools", f"{tool!r}", f"one of {', '.join(_TOOLS)}"
-
-
-def _of_private_network(host: Host) -> Problems:
-    for key, names in (("private", host.private), ("nic", (host.nic,) if host.nic else ())):
-        for name in names:
-            if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,14}", name):
-                yield key, f"{name!r}", "a network interface's name"
-    if host.private and not host.nic:
-        right = "the interface of the robot's network, on which the services get `address`"
-        yield "nic", "missing beside `private`", right
-    if host.nic and not host.private:
-        right = "the CAN interfaces that only the services are to reach"
-        yield "private", "missing beside `nic`", right
-    if len({*host.private, host.nic}) <= len(host.private):
-        found = ", ".join(host.private)
-        yield "private", found, "each interface once, and `nic` not among them"
-    most = ipaddress.ip_address(host.address).max_prefixlen
-    least = 1 if most == _IPV4_BITS else _IPV4_BITS
-    if host.private and not least <= host.prefix < most:
-        right = f"{least} to {most - 1}: the length of the network's part of `address`"
-        yield "prefix", str(host.prefix), right
-    if host.private and host.ssh.rpartition("@")[2] == host.address:
-        yield "ssh", f"{host.ssh!r}", "the host's own address: `address` is then the services'"
 
 
 def _of_address(key: str, text: str) -> Problems:

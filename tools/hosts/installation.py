@@ -16,15 +16,12 @@ from tools.hosts.hosts_file import Host, Hosts, principals_on
 from tools.hosts.layout import (
     FIREWALL,
     KEYS,
-    LINK,
-    NETWORK_UNIT,
     NFT,
     ROBOT_FILE,
     RUN_DIR,
     SCHEDULE,
     UNIT,
     firewall,
-    network_unit,
     robot_on_hosts,
     unit,
 )
@@ -72,8 +69,6 @@ def files_of(
         HostFile(f"{folder}/{FIREWALL}", firewall(spread).encode()),
         HostFile(f"{_UNIT_FOLDER}/{UNIT}", unit(hosts, host).encode()),
     ]
-    if host.private:
-        files.append(HostFile(f"{_UNIT_FOLDER}/{NETWORK_UNIT}", network_unit(host).encode()))
     if authority is not None:
         keys = bundle(authority, principals_on(host))
         files += [
@@ -85,14 +80,7 @@ def files_of(
 def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: bool) -> str:
     """Bring files to a host, and take away keys that it is not to have; a start takes them."""
     if not while_up:
-        why = "a service that crashes would come back with the new files beside the old"
-        refuse_up(remote, why)
-    state = _state(remote)
-    network_file = f"{_UNIT_FOLDER}/{NETWORK_UNIT}"
-    if state in _AT_REST and remote.run("test", "-e", network_file).code == 0:
-        # the next start makes the services' network as it is to be then
-        remote.must("systemctl", "stop", "--quiet", NETWORK_UNIT)
-        remote.must("rm", "-f", network_file)
+        _refuse_up(remote)
     folder = hosts.folder
     keys = f"{folder}/{KEYS}"
     remote.must("install", "-d", "-m", "755", folder)
@@ -115,11 +103,14 @@ def is_up(remote: Remote) -> bool:
     return _state(remote) not in _AT_REST
 
 
-def refuse_up(remote: Remote, why: str) -> None:
-    """Refuse to go on while a host's services are up."""
-    if is_up(remote):
-        text = f"{remote.host.name}: its unit is {_state(remote)}: {why}"
-        raise FleetError(f"{text}; `xrl hosts down` first, or --while-up")
+def _refuse_up(remote: Remote) -> None:
+    """Refuse new files while a host's services are up."""
+    state = _state(remote)
+    if state not in _AT_REST:
+        raise FleetError(
+            f"{remote.host.name}: its unit is {state}: a service that crashes would come back with "
+            "the new files beside the old; `xrl hosts down` first, or --while-up"
+        )
 
 
 def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
@@ -139,17 +130,10 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     if probe.schedule != wanted[SCHEDULE]:
         wrong.append("another gain schedule; `xrl hosts update`")
     wrong += _about_keys(probe, {Path(f.path).name: f.content for f in files if f.of_service})
-    for name in (UNIT, NETWORK_UNIT):
-        own_unit = remote.run("cat", f"{_UNIT_FOLDER}/{name}").out if name in wanted else ""
-        if name in wanted and digest(own_unit.encode()) != wanted[name]:
-            wrong.append(f"another {name}; `xrl hosts update`")
+    if digest(remote.run("cat", f"{_UNIT_FOLDER}/{UNIT}").out.encode()) != wanted[UNIT]:
+        wrong.append(f"another {UNIT}; `xrl hosts update`")
     state, warnings = _state(remote), list(probe.warnings)
-    if remote.host.private and state not in _AT_REST:
-        inside = remote.run("cat", "/proc/net/dev", on_bus=True).out
-        outside = [n for n in (*remote.host.private, LINK) if f"{n}:" not in inside]
-        if outside:
-            wrong.append(f"not in the services' network: {', '.join(outside)} (docs/hosts.md)")
-    if state not in _AT_REST and remote.run(NFT, "list", "table", "inet", "xrl", on_bus=True).code:
+    if state not in _AT_REST and remote.run(NFT, "list", "table", "inet", "xrl").code:
         warnings.append(f"no firewall at its ports: `nft -f {hosts.folder}/{FIREWALL}`")
     if not probe.revision:
         wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")

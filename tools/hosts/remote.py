@@ -6,19 +6,17 @@ import shlex
 import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import BinaryIO, Final, NamedTuple, TypedDict, TypeVar, Unpack
+from typing import Final, NamedTuple, TypedDict, TypeVar, Unpack
 
 from shared.exceptions import FleetError
 from tools.guarded_streams import printable
 from tools.hosts.hosts_file import Host, Hosts
-from tools.hosts.layout import IP, NAMESPACE
 
 R = TypeVar("R")
 
 TIMEOUT_S: Final = 90.0
 MARK: Final = "xrl-output-follows"
 """Line before a command's own output: a host's .bashrc may print lines before it."""
-_NOISE_MAX: Final = 1 << 20
 
 
 class Said(NamedTuple):
@@ -36,8 +34,6 @@ class Manner(TypedDict, total=False):
     """For its standard input."""
     as_user: bool
     """As the user who runs the services, not as the one who logs in."""
-    on_bus: bool
-    """It talks to the services: in their network, where that is their own."""
     timeout_s: float
 
 
@@ -47,7 +43,6 @@ class Remote:
     def __init__(self, hosts: Hosts, host: Host) -> None:
         self.host = host
         self._begin = [*hosts.ssh, host.ssh]
-        self._in_network = [IP, "netns", "exec", NAMESPACE] if host.private else []
         # from a folder that every user may enter: find and others go back to where they began
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
@@ -73,7 +68,8 @@ class Remote:
             raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(errors)}")
         noise, mark, out = done.stdout.decode(errors="replace").partition(f"{MARK}\n")
         if not mark:
-            raise self._not_run(errors or noise)
+            text = f"the shell of {self.host.ssh} did not run the command: {_last(errors or noise)}"
+            raise FleetError(f"{name}: {text}")
         return Said(done.returncode, out, errors)
 
     def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[Manner]) -> None:
@@ -101,15 +97,8 @@ class Remote:
 
     def _command(self, words: Sequence[str], manner: Manner) -> list[str]:
         """Return what this computer runs to have a host run words; they print after `MARK`."""
-        before = [
-            *(self._in_network if manner.get("on_bus") else []),
-            *(self._as_user if manner.get("as_user") else []),
-        ]
+        before = self._as_user if manner.get("as_user") else []
         return [*self._begin, f"echo {MARK}; {shlex.join([*before, *words])}"]
-
-    def _not_run(self, said: str) -> FleetError:
-        text = f"the shell of {self.host.ssh} did not run the command: {_last(said)}"
-        return FleetError(f"{self.host.name}: {text}")
 
     def must(self, *words: str, **manner: Unpack[Manner]) -> str:
         """Run a command that has to succeed, and return what it printed."""
@@ -118,25 +107,6 @@ class Remote:
             why = _last(said.error) or f"exit status {said.code}"
             raise FleetError(f"{self.host.name}: {shlex.join(words)[:120]}: {why}")
         return said.out
-
-    def fetch(self, *words: str, into: BinaryIO) -> None:
-        """Run a command as the services' user, and put what it prints into a file.
-
-        The file is then at the begin of the command's own output.
-        """
-        command = self._command(words, {"as_user": True})
-        try:
-            done = subprocess.run(command, stdout=into, stderr=subprocess.PIPE, check=False)
-        except OSError as error:
-            raise FleetError(f"{self.host.name}: {command[0]}: {error.strerror}") from None
-        if done.returncode != 0:
-            why = _last(done.stderr.decode(errors="replace"))
-            raise FleetError(f"{self.host.name}: {words[0]}: {why}")
-        into.seek(0)
-        noise, mark, _ = into.read(_NOISE_MAX).partition(f"{MARK}\n".encode())
-        if not mark:
-            raise self._not_run(noise.decode(errors="replace"))
-        into.seek(len(noise) + len(mark))
 
     def write(self, path: str, content: bytes, *, private: bool) -> None:
         """Write a file whole or not at all; a private one is the services' user's alone."""

@@ -1,35 +1,27 @@
-"""Starts, stops and looks at the services of hosts, by their units; fetches their records."""
+"""Starts, stops and looks at the services of hosts, by their units."""
 
 from __future__ import annotations
 
-import re
-import tarfile
-import tempfile
 import time
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from shared.bus.messages import DriveStatus, Mode
 from shared.bus.topics import OPERATOR
-from shared.exceptions import FleetError, RunError
+from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.fleet.fleet_status import FleetStatus, ModuleStatus
 from tools.hosts.hosts_file import Hosts
 from tools.hosts.installation import is_up
-from tools.hosts.layout import RECORDS, RUN_DIR, UNIT
+from tools.hosts.layout import RUN_DIR, UNIT
 from tools.hosts.remote import Remote
 
 HEARD_S: Final = 10.0
 """A joint service that is up is heard within this time."""
 ESTOP_S: Final = 10.0
 """A host that has not answered by then has not stopped."""
-_DATED: Final = re.compile(r"([0-9]{1,12}(?:\.[0-9]{1,12})?) (/.*)")
-"""A time, s since 1970, and a folder."""
-_PACK: Final = 'tar --warning=no-file-changed -cf - -C "$1" -- "$2"; [ $? -le 1 ]'
-"""Ends well also if a file has grown meanwhile: it is then read as far as it is whole."""
 _ARMABLE: Final = (DriveStatus.IDLE.name, DriveStatus.ERROR.name)
 
 
@@ -99,7 +91,7 @@ def lower(
             return
         first = min(up, key=lambda remote: OPERATOR not in remote.host.tools)
         words = ("down", "--lower-only", "--wait", f"{wait_s:g}", "--run-dir", RUN_DIR)
-        first.follow(_xrl(hosts), *words, tell=tell, as_user=True, on_bus=True)
+        first.follow(_xrl(hosts), *words, tell=tell, as_user=True)
     except FleetError as error:
         raise FleetError(f"nothing was stopped: {error} (here: `xrl hosts down --limp`)") from None
 
@@ -114,7 +106,7 @@ def down(hosts: Hosts, remote: Remote) -> str:
 def status(hosts: Hosts, remote: Remote) -> FleetStatus:
     """Return a host's status."""
     words = (_xrl(hosts), "status", "--json", "--run-dir", RUN_DIR)
-    said = remote.must(*words, as_user=True, on_bus=True)
+    said = remote.must(*words, as_user=True)
     try:
         return msgspec.json.decode(said.encode(), type=FleetStatus)
     except msgspec.DecodeError as error:
@@ -136,42 +128,6 @@ def joined(found: dict[str, FleetStatus]) -> FleetStatus:
     return msgspec.structs.replace(
         first, run_dir=", ".join(found), services=services, modules=modules, lead=lead
     )
-
-
-def newest_record(remote: Remote) -> str:
-    """Return the name of a host's newest record."""
-    listed = remote.must("find", RECORDS, "-name", "*.mcap", "-printf", "%T@ %h\\n", as_user=True)
-    rows = [found for line in listed.splitlines() if (found := _DATED.fullmatch(line))]
-    if not rows:
-        raise FleetError(f"{remote.host.name}: no record in {RECORDS}")
-    return _record_in(remote, max(rows, key=lambda row: float(row[1]))[2])
-
-
-def records_since(remote: Remote, wall_s: float) -> list[str]:
-    """Return the names of a host's records that were written to after a time."""
-    words = ("find", RECORDS, "-name", "*.mcap", "-newermt", f"@{wall_s:.0f}", "-printf", "%h\\n")
-    listed = remote.must(*words, as_user=True)
-    return sorted({_record_in(remote, line) for line in listed.splitlines() if line})
-
-
-def fetch_record(remote: Remote, name: str, into: Path) -> Path:
-    """Bring one record here; what is still being written comes as far as it is."""
-    try:
-        into.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=into) as packed:
-            remote.fetch("sh", "-c", _PACK, "-", RECORDS, name, into=packed)
-            with tarfile.open(fileobj=packed) as archive:
-                archive.extractall(into, filter="data")
-    except (OSError, tarfile.TarError) as error:
-        raise RunError(f"{into}: {remote.host.name}'s {name} is not written: {error}") from None
-    return into / name
-
-
-def _record_in(remote: Remote, folder: str) -> str:
-    name = folder.rsplit("/", 1)[-1]
-    if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
-        raise FleetError(f"{remote.host.name}: {name[:40]!r} is no name of a record")
-    return name
 
 
 def _xrl(hosts: Hosts) -> str:

@@ -11,7 +11,6 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from shared.bus.topics import RECORDER
 from shared.config import files as config_file
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
@@ -24,7 +23,6 @@ from tools.hosts.installation import HostFile, HostRow
 from tools.hosts.remote import Remote, on_all
 from tools.keys import authority as authorities
 from tools.keys.authority import Authority
-from tools.logs.run_index import RunIndex, runs_in
 from tools.output import write_atomically
 from tools.terminal import Console, marked
 
@@ -36,7 +34,6 @@ xrl hosts update                           # sends the files over ssh
 xrl hosts check                            # versions, keys, clocks, units
 xrl hosts up
 xrl hosts status
-xrl hosts records -o out/lab               # copies the newest records here
 xrl hosts estop
 xrl hosts down                             # goes down first, and waits until a hoist bears it
 xrl hosts down --limp                      # idles the drives at once: a standing robot falls
@@ -66,13 +63,6 @@ class UpdateFlags(HostsFlags):
 
     while_up: bool = False
     """update although services run: one that crashes restarts with the new files"""
-
-
-class RecordsFlags(FilesFlags):
-    """And when."""
-
-    while_up: bool = False
-    """copy although services run: the records share the network with the planner"""
 
 
 class HostsUpFlags(HostsFlags):
@@ -212,30 +202,6 @@ def status(flags: HostsFlags) -> int:
         if isinstance(one, FleetError):
             _tell(name, one)
     return 0 if len(good) == len(found) else FAULT_EXIT_CODE
-
-
-def bring(flags: RecordsFlags) -> int:
-    """Bring the fleet's newest record and what other hosts have recorded since it began."""
-    given = _given(flags)
-    out = flags.out
-    if out.exists() and any(out.iterdir()):
-        raise RunError(f"{out}: is not empty; give another folder")
-    body = next((one for one in given.remotes if RECORDER in one.host.services), None)
-    if body is None:
-        raise RunError("the recorder's host is not among those named: its record comes first")
-    if not flags.while_up:
-        installation.refuse_up(body, "the records would delay the planner on the same network")
-    base = running.fetch_record(body, running.newest_record(body), out / body.host.name)
-    _tell(body.host.name, str(base))
-    began_s = RunIndex(base, runs_in(base)[-1]).began_ns * 1e-9
-
-    def one(remote: Remote) -> str:
-        names = running.records_since(remote, began_s)
-        mine = [running.fetch_record(remote, name, out / remote.host.name) for name in names]
-        return ", ".join(map(str, mine)) or "no record since then"
-
-    others = [one for one in given.remotes if one is not body and one.host.record]
-    return _each(given._replace(remotes=others), one) if others else 0
 
 
 def check(flags: HostsFlags) -> int:

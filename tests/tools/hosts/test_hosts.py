@@ -92,15 +92,6 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a folder with a quote": ({"folder": "/etc/x'"}, "an absolute path"),
     "a name that is allowed": ({"allow": ["laptop"]}, "an IP address"),
     "a user": ({"user": "a b"}, "a user's name"),
-    "a private interface without a network": ({"private1": ["can0"]}, "the robot's network"),
-    "a network without a private interface": ({"nic1": "eth0"}, "missing beside `nic`"),
-    "the network among the private": ({"private1": ["eth0"], "nic1": "eth0"}, "not among them"),
-    "an address twice in use": (
-        {"private1": ["can0"], "nic1": "eth0", "ssh1": "root@127.0.0.3"},
-        "the host's own",
-    ),
-    "a network of one": ({"private1": ["can0"], "nic1": "eth0", "prefix1": 32}, "1 to 31"),
-    "an interface's name": ({"private1": ["can 0"], "nic1": "eth0"}, "an interface's name|name"),
     "an unknown key": ({"colour": "red"}, "colour"),
 }
 

@@ -8,9 +8,8 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
-from tests.shared.mcap_log import runs
 from tests.tools.hosts.places import make_hosts
-from tools.hosts import hosts_file, installation, running
+from tools.hosts import hosts_file, installation
 from tools.hosts.remote import Remote
 
 NOISE = 'echo "Welcome to $1"; echo "17"; printf "no end of line> "'
@@ -43,15 +42,6 @@ def test_a_commands_output_is_its_own(remote: Remote) -> None:
     remote.follow("printf", "one\\ntwo\\n", tell=told.append)
     assert told == ["body: one", "body: two"]
     assert installation.is_up(remote) is False
-
-
-def test_a_record_comes_whole(base: Path, remote: Remote, tmp_path: Path) -> None:
-    folder = base / "body/var/lib/xrl/out/first"
-    path = runs.write(folder, [runs.item(seq) for seq in range(100)])
-    assert running.newest_record(remote) == "first"
-    assert running.records_since(remote, 0.0) == ["first"]
-    copy = running.fetch_record(remote, "first", tmp_path / "here") / path.name
-    assert copy.read_bytes() == path.read_bytes()
 
 
 def test_a_shell_that_does_not_run_the_command_is_an_error(base: Path, robot: RobotConfig) -> None:
