@@ -105,7 +105,7 @@ class Console(rich.console.Console):
 
 @contextlib.contextmanager
 def renewed(
-    console: Console, *, screen: bool = False, transient: bool = False
+    console: Console, *, transient: bool = False
 ) -> Iterator[Callable[[RenderableType], None]]:
     """Give what shows the newest of something: in its place on a terminal, else below the last."""
     if not console.is_terminal:
@@ -116,5 +116,5 @@ def renewed(
 
         yield show
         return
-    with Live(console=console, auto_refresh=False, screen=screen, transient=transient) as live:
+    with Live(console=console, auto_refresh=False, transient=transient) as live:
         yield lambda shown: live.update(shown, refresh=True)

@@ -23,7 +23,7 @@ class Verb(NamedTuple):
     """
 
     name: str
-    """What is typed: `demo`; or nouns and a verb, `log info`, `drive can setup`."""
+    """What is typed: `demo`; or a noun and a verb, `log info`."""
     help: str
     at: str = ""
     """MODULE:FUNCTION, below `tools.verbs` if it does not begin with `tools.`; none: `run` in the
@@ -69,7 +69,6 @@ class Verb(NamedTuple):
 
 NOUNS: Final = {
     "drive": "set up, move and measure drives",
-    "drive can": "bring the CAN buses up, listen to them, measure how fast drives answer",
     "log": "inspect, export, replay records",
     "topic": "show what is on the bus",
     "study": "run many cases: who falls, and why",
@@ -110,8 +109,6 @@ VERBS: Final = (
     Verb("drive zero", "write each joint's position to its drive"),
     Verb("drive jog", "move one joint of one module a little and judge the response"),
     Verb("drive tare", "set the harness's zero from its unloaded reading"),
-    Verb("drive can setup", "bring the kernel's CAN interfaces up", "drive.can:set_up"),
-    Verb("drive can test", "listen and count what each drive and sensor sends", "drive.can:test"),
     Verb("drive identify", "measure a hanging joint's friction and reflected inertia"),
     Verb("log info", "show what is in a log: topics, rates, gaps, losses"),
     Verb("log recover", "make a complete log from one that was cut off"),
@@ -142,7 +139,6 @@ VERBS: Final = (
     Verb("hosts check", "check the hosts' files, versions, keys, clocks and units", "hosts:check"),
     Verb("hosts up", "start the services on all hosts, and arm the drives", "hosts:up"),
     Verb("hosts status", "show the services of all hosts in one table", "hosts:status"),
-    Verb("hosts records", "copy the newest records here", "hosts:bring"),
     Verb("hosts estop", "stop every module, by each host's own shared memory", "hosts:estop"),
     Verb("hosts down", "stop the services on all hosts", "hosts:down"),
     Verb("keys make", "make a robot's authority, and a certificate for each process", "keys:make"),

@@ -464,12 +464,6 @@ def test_status_hz_and_echo_show_what_the_services_send(start: Start, order: Ord
     code, said = order(*words)
     assert (code, "mode: HOLD (1)" in said) == (0, True)
 
-    code, shown = order("status", "--traffic")
-    assert code == 0
-    assert str(fleet.pids()["ankle_right"]) in shown
-    assert "joint/ankle_right/state" in shown
-    assert "planner/status" not in shown, "on which nothing has come"
-
 
 def test_a_second_fleet_here_is_refused_and_the_first_is_killed_and_ended_by_verbs(
     start: Start, run_dir: Path, order: Order

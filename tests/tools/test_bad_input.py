@@ -40,7 +40,7 @@ CASES: list[list[str]] = [
     *(["sim", flag, "/dev/zero"] for flag in ("--config", "--scenario")),
     ["log", "report", RUN, "-o", LONG, "--open", "no"],
     ["log", "export", RUN, "--gif", LONG],
-    ["gains", "--stiffness", "--config", "/dev/zero"],
+    ["gains", "--check", "--config", "/dev/zero"],
     ["status", "--run-dir", LONG],
     ["down", "--run-dir", LONG],
 ]  # fmt: skip
@@ -87,7 +87,7 @@ def test_a_robot_file_that_is_none_is_refused(
 ) -> None:
     path = tmp_path / "robot.toml"
     path.write_bytes(content)
-    assert words in told(["gains", "--stiffness", "--config", str(path)], capsys)
+    assert words in told(["gains", "--check", "--config", str(path)], capsys)
 
 
 # -- logs that somebody made up ------------------------------------------------------------

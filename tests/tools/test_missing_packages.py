@@ -32,7 +32,6 @@ from tools.verbs import doctor
         ("view --sim", "sim"),
         ("up --run-dir run --out o", "sim"),
         ("up --run-dir run --out o --no-sim --ros2", "ros2"),
-        ("up --view", "view"),
         ("log export OUT --gif a.gif", "plot"),
         ("log export OUT --ros2bag bag", "ros2"),
         ("ros2 check", "ros2"),

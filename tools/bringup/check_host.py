@@ -219,16 +219,6 @@ def interfaces_of(robot: RobotConfig) -> list[str]:
     return sorted({bus.channel for bus in used if bus.interface == "socketcan"})
 
 
-def setup_commands(name: str) -> list[list[str]]:
-    """Return the commands that bring an interface up as the drives and services need it."""
-    up = ["type", "can", "bitrate", str(CAN_BAUD_RATE), "restart-ms", "100"]
-    return [
-        ["ip", "link", "set", name, "down"],
-        ["ip", "link", "set", name, "up", *up],
-        ["ip", "link", "set", name, "txqueuelen", "64"],
-    ]
-
-
 def up_command(name: str) -> str:
     """Return how an interface is brought up."""
     return f"`sudo ip link set {name} up type can bitrate {CAN_BAUD_RATE} restart-ms 100`"

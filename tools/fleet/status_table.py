@@ -1,9 +1,9 @@
-"""A fleet's status, processes and neighbours as text and tables."""
+"""A fleet's status and neighbours as text and tables."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator
 from pathlib import Path
 from typing import Final, Literal, TypeVar
 
@@ -15,8 +15,6 @@ from rich.text import Text
 from shared.bus.messages import LEFT_MAX_S, DriveStatus, Refusal
 from tools.fleet import procfs
 from tools.fleet.fleet_status import OPEN, SILENT_PROXY, FleetStatus, LeadStatus
-from tools.fleet.procfs import ProcessUse
-from tools.fleet.supervisor_client import ServiceInfo
 from tools.guarded_streams import printable
 from tools.terminal import Console, marked
 
@@ -182,41 +180,6 @@ def _lines(status: FleetStatus) -> Iterator[str | Text]:
     )
     for template, texts in sections:
         yield from (marked(template, text) for text in texts if text)
-
-
-def process_table(
-    services: Sequence[ServiceInfo],
-    before: Mapping[int, ProcessUse],
-    after: Mapping[int, ProcessUse],
-    window_s: float,
-) -> Table:
-    """Return one row for each process, and their sum; the window is of the machine's clock."""
-    table = Table(box=box.SIMPLE_HEAD, show_footer=True)
-    shares = {
-        pid: 100.0 * (use.cpu_s - before[pid].cpu_s) / window_s
-        for pid, use in after.items()
-        if pid in before
-    }
-    total, memory = sum(shares.values()), sum(use.memory_mib for use in after.values())
-    table.add_column("process", "all", no_wrap=True)
-    table.add_column("state", no_wrap=True)
-    for heading, footer in (
-        ("pid", ""), ("CPU % of a core", f"{total:.1f}"), ("MiB", f"{memory:.0f}"),
-        ("up s", ""), ("restarts", ""),
-    ):  # fmt: skip
-        table.add_column(heading, footer, justify="right", no_wrap=True)
-    for row in services:
-        pid = row.pid or 0
-        table.add_row(
-            row.name,
-            _state_cell(row.state),
-            str(row.pid or "-"),
-            f"{shares[pid]:.1f}" if pid in shares else "-",
-            f"{after[pid].memory_mib:.0f}" if pid in after else "-",
-            f"{row.uptime_s:.0f}",
-            str(row.restarts),
-        )
-    return table
 
 
 HOT_S: Final = 60.0

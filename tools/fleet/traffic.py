@@ -113,15 +113,14 @@ class Traffic:
         return time.monotonic() - began
 
 
-def traffic_table(traffic: Traffic, window_s: float, *, only_seen: bool = False) -> Table:
+def traffic_table(traffic: Traffic, window_s: float) -> Table:
     """Return one row for each key; the window is in s of the fleet's clock."""
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("topic", no_wrap=True)
     for heading in ("Hz", "apart ms", "age ms", "bytes", "kB/s", "lost"):
         table.add_column(heading, justify="right", no_wrap=True)
     for one in traffic.keys.values():
-        if one.count or not only_seen:
-            table.add_row(one.key.name, *_cells(one, window_s))
+        table.add_row(one.key.name, *_cells(one, window_s))
     return table
 
 

@@ -18,7 +18,6 @@ from shared.config import files as config_file
 from shared.config import gain_schedule
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError, FleetError, RunError
-from shared.extras import require
 from shared.joints import MODULES
 from tools.flags import Arg, ConfigFlags, Folder, Number, RunDirFlags, names_of, parsed
 from tools.fleet.fleet_status import OPEN
@@ -35,8 +34,6 @@ from tools.live.experiment import (
     scenario_file,
 )
 from tools.terminal import Console, marked
-from tools.view.live import LiveSource
-from tools.view.serving import PortFlags, serve
 
 SETTLE_S = 3.0
 """A scenario starts so long after the hoist is down."""
@@ -45,7 +42,6 @@ SETTLE_S = 3.0
 EXAMPLES: Final = """
 xrl up
 xrl up --scenario crawl --out out/crawl
-xrl up --view                                  # and lead it by hand, in a browser
 xrl up --ros2                                  # ROS 2 sees it: docs/ros2.md
 xrl up --ros2 --domain 7 --accept estop        # and may stop it
 xrl up --injectable                            # then: xrl inject 'all delay=30'
@@ -57,7 +53,7 @@ xrl up --config lab.toml --no-sim --readonly   # to move the joints by hand and 
 """
 
 
-class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags, PortFlags):
+class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
     """Which services are started, and how."""
 
     out: Folder | None = None
@@ -82,9 +78,6 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags, 
     disarmed: bool = False
     """arm no drive until a person asks (xrl kill MODULE), but take over drives that hold; for
     automatic starts, as after a power cut"""
-    view: bool = False
-    """then show the robot in a browser until Ctrl-C, as `xrl view` does; the page may act on a
-    simulated robot. The fleet stays up"""
     ros2: bool = False
     """show the robot to ROS 2 over Zenoh: joint states, transforms, diagnostics (docs/ros2.md)"""
     domain: Annotated[int | None, parsed(rmw.domain, "N")] = None
@@ -139,8 +132,6 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags, 
 
 def run(flags: UpFlags) -> int:
     """Start the fleet and say where it is."""
-    if flags.view:
-        require("view", "leave --view")
     robot = config_file.load(flags.config)
     gain_schedule.require(robot, flags.config)
     if robot.bus.security.mode == "mtls":
@@ -185,12 +176,6 @@ def run(flags: UpFlags) -> int:
     )
     if robot.bus.security.mode == "open":
         Console().print(marked("[bold red]{}[/]", OPEN))
-    if flags.view:
-        live = LiveSource(robot, fleet, act="simulator" in fleet.manifest.services)
-        try:
-            serve(live, flags.port)
-        finally:
-            live.disconnect()
     return 0
 
 

@@ -24,7 +24,7 @@ _ROUNDS = 64  # a client that floods the bus must not hold up the simulator
 _FRAME_BYTES = 16
 _INT = struct.Struct("i")
 TXQUEUELEN: Final = 64
-"""Frames that wait in an interface's queue: what `xrl drive can setup` sets."""
+"""Frames that wait in an interface's queue: what `deploy/udev/92-can.rules` sets."""
 
 
 class UnixCanHub:

@@ -150,7 +150,7 @@ def _measure(
         return moved
     fit = fit_sines(moved.samples, moved.plan)
     if fit is None:
-        return Stopped(f"{name}: too few samples for a fit; see its bus (`xrl drive can test`)")
+        return Stopped(f"{name}: too few samples for a fit; see its bus (`xrl doctor`)")
     return JointResult(name, fit, hanging_joint(robot, moved.q, *joint).inertia)
 
 
