@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +14,10 @@ from shared.bus.messages import Estop, JointState, OperatorIntent, PlannerStatus
 from shared.bus.session import Session, open_session
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
+from shared.config.scenarios import SCENARIO
 from shared.exceptions import BusError, FleetError
 from shared.joints import MODULES
-from tools.live.assist_request import asker, other_asker
+from shared.places import user_name
 from tools.live.descent import WAYS, Ask, Descent, DescentPhase
 
 LOOK_S: Final = 0.02
@@ -28,6 +30,17 @@ WAITING_TELL_S: Final = 5.0
 HINT: Final = "; take its weight: hang it, feet in the air, or put a stand under its torso"
 
 Tell = Callable[[str], None]
+
+
+def asker(verb: str) -> str:
+    """Return the requester's name for a verb, as `OperatorIntent.source` has it."""
+    return f"xrl {verb} by {user_name()} ({os.getpid()})"
+
+
+def other_asker(status: PlannerStatus | None, own: str = "") -> str:
+    """Return who else requests something of the planner; "" if only a scenario or nobody does."""
+    by = "" if status is None else status.requested_by
+    return "" if by in (SCENARIO, own) else by
 
 
 def lower(robot: RobotConfig, run_dir: Path, tell: Tell, *, wait_s: float, simulated: bool) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from enum import Enum
-from pathlib import Path
 from typing import Annotated, Final
 
 from rich.live import Live
@@ -13,18 +12,18 @@ from rich.text import Text
 
 from shared.bus import topics
 from shared.bus.credentials import require_operator
-from shared.bus.messages import STRAIGHT, HandLead, OperatorIntent, PlannerStatus
+from shared.bus.messages import HandLead, OperatorIntent, PlannerStatus
 from shared.bus.session import Session, open_session
 from shared.bus.traces import SimTruth
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, HungUpError
 from shared.process import StopFlag
-from tools.flags import Arg, Duration, Number, RunDirFlags, numbers, option, parsed
+from tools.flags import Arg, RunDirFlags
 from tools.fleet.emergency_stop import BusStop, refuse_going, request_here
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
-from tools.live.assist_request import ask, asker, other_asker, refuse_beyond_limits
+from tools.live.lowering import asker, other_asker
 from tools.pads.gamepad import BUTTONS, Gamepad, find_pad
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
@@ -62,8 +61,6 @@ EXAMPLES: Final = """
 xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
 xrl lead --keys          # arrows: height and pitch; + and -: assist; space: stop
 xrl lead --pad Xbox --hold leftshoulder --stop x
-xrl lead --assist 80 --for 60             # no pad: N for a minute, then it fades out
-xrl lead --assist 0 --shift 0.02,0,0,0    # lean the COM 2 cm forwards
 """
 
 
@@ -74,15 +71,6 @@ class LeadFlags(RunDirFlags):
     """lead by the keys of this terminal, not a gamepad"""
     pad: Annotated[str | None, Arg(metavar="NAME", exclusive="by")] = None
     """part of the pad's name or path, such as Xbox or /dev/input/event7 (default: the first pad)"""
-    assist: Annotated[Number | None, Arg(metavar="N", exclusive="by")] = None
-    """lead nothing: ask the robot to carry N newtons of the person until Ctrl-C; then fade out"""
-    shift: Annotated[
-        tuple[float, ...] | None,
-        parsed(numbers(4, "such as 0.02,0,0,0"), "X,Y,ROLL,YAW", is_one=True),
-    ] = None
-    """with --assist: offset of COM (m) and torso (rad) from a straight stand (0,0,0,0)"""
-    for_s: Annotated[Duration | None, option("--for")] = None
-    """with --assist: duration, s"""
     hold: Annotated[str, Arg(choices=BUTTONS)] = "rightshoulder"
     """dead man's button"""
     stop: Annotated[str, Arg(choices=BUTTONS)] = "b"
@@ -93,16 +81,12 @@ class LeadFlags(RunDirFlags):
         super().check()
         if self.hold == self.stop:
             raise FleetError(f"--hold and --stop are both {self.hold}; give two buttons")
-        if self.assist is None and (self.shift is not None or self.for_s is not None):
-            raise FleetError("--shift and --for go with --assist N; --assist 0 only shifts")
 
 
 def run(flags: LeadFlags) -> int:
     """Lead until q, Ctrl-C, the stop, or the loss of the pad."""
     fleet = SupervisedFleet.attach(flags.run_dir)
     robot = fleet.manifest.robot()
-    if flags.assist is not None:
-        return _ask(robot, fleet.run.path, flags.assist, flags)
     require_operator(robot, "lead")
     pad = None
     if not flags.keys:
@@ -119,24 +103,6 @@ def run(flags: LeadFlags) -> int:
         request_here(fleet.run.path)
         refuse_going(BusStop(robot, session, fleet.run.path).stop())
     console.print("stopped: DAMP. It sinks slowly; `xrl status` names the way out")
-    return 0
-
-
-def _ask(robot: RobotConfig, run_dir: Path, assist_n: float, flags: LeadFlags) -> int:
-    """Publish a request for assist until stopped."""
-    x, y, roll, yaw = flags.shift or STRAIGHT
-    request = OperatorIntent(
-        t_ns=now_ns(), seq=0, assist_n=assist_n, shift=(x, y, roll, yaw), source=asker("lead")
-    )
-    refuse_beyond_limits(robot, request.assist_n, request.shift)
-    stop = StopFlag()
-    with open_session(robot, "lead", run_dir) as session:
-        intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
-        statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
-        with Live(console=Console(), refresh_per_second=4, transient=True) as shown:
-            given = ask(intents, statuses, request, lambda: bool(stop), shown, for_s=flags.for_s)
-    fade_s = robot.assist.fade_s
-    Console().print(f"request ended: {given:.0f} N were given; they fade out in {fade_s:g} s")
     return 0
 
 
