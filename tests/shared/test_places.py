@@ -31,8 +31,7 @@ from tools.verbs import estop
 
 SAID = "config: ./robot.toml\n"
 DECIDE_LATER = {
-    "doctor", "drive configure", "drive identify", "drive jog", "drive zero", "estop",
-    "log explain", "view",
+    "doctor", "drive configure", "drive identify", "drive jog", "drive zero", "estop", "view",
 }  # fmt: skip
 """Verbs that take a running fleet's or a record's robot before they look for a file."""
 

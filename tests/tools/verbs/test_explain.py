@@ -1,9 +1,7 @@
-"""`xrl log explain`: one tick of a run, or a pose, laid open."""
+"""`xrl log explain`: one tick of a run laid open."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
 import re
 
@@ -12,16 +10,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from services.planner.law.kinematics import Kinematics
 from shared.bus import topics
 from shared.bus.messages import PlannerStatus
 from shared.config.robot_config import RobotConfig
+from shared.exceptions import RunError
 from shared.joints import JOINTS, MODULES, N_JOINTS
-from shared.robot.robot_model import stand_pose
 from tools import cli
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.torque_breakdown import torque_breakdown
 from tools.logs.run_log import RunLog, robot_of
+from tools.terminal import Console
 from tools.verbs.log import explain
 
 
@@ -105,24 +103,6 @@ def test_the_torques_by_origin_of_every_joint_are_printed(
     assert re.search(r"push sideways: led \d+ N \(.+\), planner dead \d+ N", shown)
 
 
-def test_a_pose_is_explained_without_a_log(
-    robot: RobotConfig, capsys: pytest.CaptureFixture[str]
-) -> None:
-    q = stand_pose(robot, 1.0)
-    assert cli.main(["log", "explain", "--q", ",".join(f"{angle:.6f}" for angle in q)]) == 0
-    kinematics = Kinematics(robot)
-    kinematics.update(np.array(q))
-    assert f"{kinematics.p[2]:.4f}" in capsys.readouterr().out
-
-
-def test_a_pose_is_found_and_explained(
-    robot: RobotConfig, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["log", "explain", "--p", "0.01,0,0.75,0,0.6,0.1"]) == 0
-    shown = capsys.readouterr().out
-    assert re.search(r"p: m, rad +0.0100 +0.0000 +0.7500 +0.0000 +0.6000 +0.1000", shown)
-
-
 def test_a_time_without_ticks_names_the_times_with_some(
     log: RunLog, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -133,7 +113,13 @@ def test_a_time_without_ticks_names_the_times_with_some(
 @settings(max_examples=20)
 @given(q=st.lists(st.floats(-2 * math.pi, 2 * math.pi), min_size=N_JOINTS, max_size=N_JOINTS))
 @example(q=[2.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 3.0, 0.0])
-def test_every_pose_within_a_turn_is_explained_or_called_singular(q: list[float]) -> None:
-    with contextlib.redirect_stderr(io.StringIO()) as told:
-        code = cli.main(["log", "explain", f"--q={','.join(map(str, q))}"])
-    assert code == 0 or (code == 2 and "singular pose" in told.getvalue())
+def test_every_pose_within_a_turn_is_explained_or_called_singular(
+    robot: RobotConfig, q: list[float]
+) -> None:
+    angles, still, said = np.array(q), np.zeros(N_JOINTS), "singular pose"
+    try:
+        found = torque_breakdown(robot, angles, still, angles, still, 0.0)
+        explain.show(robot, found, Console(quiet=True))
+    except RunError as error:
+        said = str(error)
+    assert "singular pose" in said

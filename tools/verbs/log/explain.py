@@ -1,10 +1,9 @@
-"""`xrl log explain`: one tick of the law laid open, from a run's log or for a pose."""
+"""`xrl log explain`: one tick of the law laid open, from a run's log."""
 
 from __future__ import annotations
 
 import bisect
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
@@ -13,8 +12,6 @@ from rich.table import Table
 from rich.text import Text
 
 from services.planner.law.certificate import Weakest
-from services.planner.law.kinematics import Kinematics
-from shared import places
 from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import (
@@ -28,26 +25,18 @@ from shared.bus.messages import (
     name_of,
 )
 from shared.clock import NS_PER_MS
-from shared.config import files as config_file
-from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import JOINTS, MODULES, N_JOINTS
-from shared.robot.robot_model import stand_pose
-from shared.toml_file import read_text
-from tools.flags import Arg, Flags, Number, Run, finite_numbers, robot_file_of
+from shared.joints import JOINTS, MODULES
+from tools.flags import Arg, Flags, Number, Run
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.push_limit import PushLimits
 from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
 from tools.logs.impairment_intervals import impairments
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
-from tools.reach import ReachSolver
-from tools.reach import describe as describe_reach
 from tools.terminal import Console, marked
 
-POSE_MAX: Final = 10.0
-"""m and rad; no pose of such a robot is beyond."""
 AWAY_S = 0.1
 """s; a tick that much older than the requested time does not describe the robot then."""
 LONG_S: Final = 60.0
@@ -73,54 +62,20 @@ class Tick(NamedTuple):
 
 EXAMPLES: Final = """
 xrl log explain out/a/run.mcap --at 2.5
-xrl log explain --q 0,0.139,0,-1.015,0,0.876,0,0.139,0,-1.015,0,0.876
-xrl log explain --q stand.txt --assist 200 --config lab.toml
-xrl log explain --p 0,0,0.75,0,0.6,0
 """
 
 
 class ExplainFlags(Flags):
-    """Which tick: one of a run, or that of a pose at rest."""
+    """Which tick of which run."""
 
-    log: Run | None = None
+    log: Run
     at: Annotated[Number | None, Arg(metavar="T")] = None
     """scenario time, s (default: the end)"""
-    q: Annotated[
-        str | None,
-        Arg(
-            metavar="ANGLES|FILE",
-            help="explain a robot at rest at twelve joint angles in rad, separated by commas: "
-            f"{', '.join(JOINTS[:4])}, ...; or a file that holds them",
-        ),
-    ] = None
-    p: Annotated[str | None, Arg(metavar="POSE")] = None
-    """explain a robot at rest at p: COM x, y, z in m and torso roll, pitch, yaw in rad, separated
-    by commas"""
-    assist: Annotated[Number, Arg(metavar="N")] = 0.0
-    """with --q and --p"""
-    config: Annotated[Path | None, robot_file_of("that in the log")] = None
-
-    def check(self) -> None:
-        """Refuse none, and several."""
-        super().check()
-        if sum(given is not None for given in (self.log, self.q, self.p)) != 1:
-            raise RunError("give a run's log, --q ANGLES or --p POSE; one of them")
 
 
 def run(flags: ExplainFlags) -> int:
     """Print the account of one tick."""
     console = Console()
-    if flags.log is None:
-        path = places.robot_file(flags.config)
-        robot = config_file.load(path)
-        gain_schedule.require(robot, path)
-        if flags.q is not None:
-            q = parse("--q", flags.q, N_JOINTS, 2 * np.pi, "rad")
-        else:
-            q = at_pose(robot, flags.p or "")
-        still = np.zeros(N_JOINTS)
-        show(robot, torque_breakdown(robot, q, still, q, still, flags.assist), console)
-        return 0
     index = RunIndex(flags.log)
     zero = zero_ns(index)
     log = read_around(index, zero, flags.at)
@@ -143,37 +98,6 @@ def run(flags: ExplainFlags) -> int:
         style="dim",
     )
     return 0
-
-
-def parse(flag: str, text: str, count: int, largest: float, unit: str) -> Array:
-    """Read so many numbers from a text, or from the file that it names."""
-    try:
-        return np.array(finite_numbers(_content(text), count, largest))
-    except OSError as error:
-        raise RunError(f"{flag} {text}: {error.strerror}") from None
-    except ValueError as error:
-        raise RunError(f"{flag}: {error}; {unit}, separated by commas, or a file of them") from None
-
-
-def _content(text: str) -> str:
-    """Return a text, or what the file holds that it names; many digits are no file's name."""
-    try:
-        named = Path(text).is_file()
-    except OSError:
-        named = False
-    return read_text(Path(text)) if named else text
-
-
-def at_pose(robot: RobotConfig, text: str) -> Array:
-    """Return the joint angles (12,), rad, at a pose p given as text."""
-    p_ref = parse("--p", text, 6, POSE_MAX, "m and rad")
-    limits = np.array(robot.joint_limits())
-    ik = ReachSolver(Kinematics(robot), limits)
-    ik.q[:] = stand_pose(robot, robot.simulation.stand_height)
-    reach = ik.solve_from_anywhere(p_ref)
-    if not reach.converged:
-        raise RunError(describe_reach(reach, p_ref, limits))
-    return ik.q
 
 
 def read_around(index: RunIndex, zero: int, at_s: float | None) -> RunLog:
