@@ -130,35 +130,23 @@ def names_of(known: Collection[str] = ()) -> Callable[[str], tuple[str, ...]]:
 
 
 def numbers(count: int, like: str) -> Callable[[str], tuple[float, ...]]:
-    """Return what reads so many numbers; `like` says what they are, and how they are written."""
+    """Return what reads a count of numbers, separated by commas or spaces, such as `like`."""
 
     def parse(text: str) -> tuple[float, ...]:
-        try:
-            return finite_numbers(text, count)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(f"{error}; {like}") from None
+        words = text.replace(",", " ").split()
+        if len(words) != count:
+            raise argparse.ArgumentTypeError(f"{len(words)} numbers; {count} are right; {like}")
+        found = []
+        for word in words:
+            try:
+                found.append(float(word))
+            except ValueError:
+                found.append(math.nan)
+            if not abs(found[-1]) <= FINITE_MAX:
+                raise argparse.ArgumentTypeError(f"{word[:40]!r}: no such number; {like}")
+        return tuple(found)
 
     return parse
-
-
-def finite_numbers(text: str, count: int, largest: float = FINITE_MAX) -> tuple[float, ...]:
-    """Return so many numbers of a text, separated by commas or spaces, none beyond +-largest.
-
-    Raises:
-        ValueError: there are more or fewer, or one is none, not finite or too large; says which.
-    """
-    words = text.replace(",", " ").split()
-    if len(words) != count:
-        raise ValueError(f"{len(words)} numbers; {count} are right")
-    found = []
-    for place, word in enumerate(words, 1):
-        try:
-            found.append(float(word))
-        except ValueError:
-            found.append(math.nan)
-        if not abs(found[-1]) <= largest:
-            raise ValueError(f"number {place}, {word[:40]!r}: one within +-{largest:.4g} is right")
-    return tuple(found)
 
 
 class _Field(NamedTuple):

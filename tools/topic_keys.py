@@ -1,7 +1,7 @@
 """Keys of the bus by the names that a person types, such as `joint/*/state`.
 
-A name is what follows `xrl/<robot>/` in a key; `match` takes the whole key too. In a name `*`
-stands for any part of one section (`joint/*/state`), `**` for any number of sections.
+A name is what follows `xrl/<robot>/` in a key. In a name `*` stands for any part of one section
+(`joint/*/state`), `**` for any number of sections.
 """
 
 from __future__ import annotations
@@ -16,10 +16,7 @@ from shared.config.robot_config import SERVICES
 from shared.exceptions import RunError
 from shared.joints import MODULES
 
-LIVE: Final = "xrl"
-"""First section of every key that a robot's services use."""
-
-_PARTS: Final = {"**": "(.*)", "*": "([^/]*)"}
+_PARTS: Final = {"**": ".*", "*": "[^/]*"}
 
 
 class TopicKey(NamedTuple):
@@ -44,29 +41,17 @@ def every_key() -> list[TopicKey]:
     ]
 
 
-def short(key: str) -> str:
-    """Return a key without the `xrl/<robot>/` before it; another key as it is."""
-    parts = key.split("/", 2)
-    return parts[2] if len(parts) == 3 and parts[0] == LIVE else key
-
-
-def match(name: str, key: str) -> re.Match[str] | None:
-    """Return what the stars of a name stand for in a key, whole or short; None: another key."""
+def _is_named(key: TopicKey, name: str) -> bool:
     parts = re.split(r"(\*\*|\*)", name.strip("/"))
     pattern = "".join(_PARTS.get(part) or re.escape(part) for part in parts)
-    return re.fullmatch(pattern, key if name.partition("/")[0] == LIVE else short(key))
-
-
-def row_of(name: str) -> str:
-    """Return the row of the table of topics that a name belongs to; else the name."""
-    return next((topic.name for topic in topics.TOPICS if match(topic.name, name)), name)
+    return re.fullmatch(pattern, key.name) is not None
 
 
 def keys_named(names: Sequence[str], left_out: Collection[Topic] = ()) -> list[TopicKey]:
     """Return the keys that have one of these names, in the order of the table of topics."""
     known = every_key()
     for name in names:
-        if not any(match(name, key.name) for key in known):
+        if not any(_is_named(key, name) for key in known):
             rows = ", ".join(topic.name for topic in topics.TOPICS)
             raise RunError(
                 f"{name}: no topic is so named; there are {rows}; * stands for a part between "
@@ -74,7 +59,7 @@ def keys_named(names: Sequence[str], left_out: Collection[Topic] = ()) -> list[T
             )
     if not names:
         return [key for key in known if key.topic not in left_out]
-    return [key for key in known if any(match(name, key.name) for name in names)]
+    return [key for key in known if any(_is_named(key, name) for name in names)]
 
 
 def sender_of(topic: Topic, module: str = "") -> str:

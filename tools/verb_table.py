@@ -119,7 +119,6 @@ VERBS: Final = (
     Verb("log resim", "run a log's services again and compare, bit for bit or changed"),
     Verb("log whatif", "kill a service at each moment of a run: would it have stood?"),
     Verb("topic echo", "print the messages of a topic as they come"),
-    Verb("topic hz", "measure the rate, spacing, age and size of topics"),
     *(
         Verb(f"study {name}", about, f"tools.lab.studies.sweeps.{name}")
         for name, about in (

@@ -263,7 +263,7 @@ def test_version_and_help_are_flags_and_help_is_a_word_too(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     said = []
-    for line in ("--version", "help", "--help", "help topic hz", "topic hz --help"):
+    for line in ("--version", "help", "--help", "help topic echo", "topic echo --help"):
         with pytest.raises(SystemExit) as left:
             cli.main(line.split())
         assert left.value.code == 0

@@ -338,15 +338,6 @@ def is_elsewhere(endpoint: str) -> bool:
     return not endpoint.startswith(UNIX) and _tcp_fault(endpoint) == _ELSEWHERE
 
 
-def services_elsewhere(config: RobotConfig, run_dir: Path) -> tuple[str, ...]:
-    """Return the services of a robot that run on other hosts than this."""
-    return tuple(
-        name
-        for name, endpoint in config.bus.endpoints.items()
-        if is_elsewhere(expand(endpoint, run_dir))
-    )
-
-
 def is_listening(endpoint: str) -> bool:
     """Return True if some process listens on a bus endpoint."""
     address: str | tuple[str, int]
