@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
+import msgspec
 from rich import box
 from rich.table import Table
 from rich.text import Text
@@ -43,7 +43,7 @@ INJECTED_MAX: Final = 12
 EXAMPLES: Final = """
 xrl log info out/a/run.mcap
 xrl log info out/a/run.mcap --run
-xrl log info out/a/run.mcap --json | jq '.topics | map_values(.lost)'
+xrl log info out/a/run.mcap --json | jq '.topics | map_values(.sequence.missing)'
 """
 
 
@@ -62,7 +62,7 @@ class InfoFlags(Flags):
         ),
     ] = False
     json: bool = False
-    """print JSON, in SI units"""
+    """print JSON"""
 
 
 def run(flags: InfoFlags) -> int:
@@ -76,7 +76,8 @@ def run(flags: InfoFlags) -> int:
         for path in run_files:
             _add(survey, path, full=flags.full)
     if flags.json:
-        print(json.dumps(as_json(survey, run_files), indent=2))
+        found = {"run_files": run_files, "files": survey.files, "topics": survey.topics}
+        print(msgspec.json.format(msgspec.json.encode(found, enc_hook=str)).decode())
     else:
         show(survey, run_files, Console())
     return 0
@@ -85,38 +86,6 @@ def run(flags: InfoFlags) -> int:
 def _add(survey: Survey, path: Path, *, full: bool) -> FileFacts:
     large = path.is_file() and path.stat().st_size > LARGE
     return survey.add(path, by_index=large and not full)
-
-
-def as_json(survey: Survey, run_files: list[Path]) -> dict[str, Any]:
-    """Return the survey as plain values: SI units, times in ns since 1970."""
-    about = survey.files[0].metadata.get("run", {})
-    return {
-        "files": [_file_as_json(file) for file in survey.files],
-        "run_files": [str(path) for path in run_files],
-        "robot": about.get("robot"),
-        "scenario": about.get("scenario"),
-        "git_commit": about.get("git_commit"),
-        "schema_version": about.get("schema_version"),
-        "start_ns": survey.first_ns if survey.messages else None,
-        "duration_s": _seconds(survey.first_ns, survey.last_ns) if survey.messages else None,
-        "messages": survey.messages,
-        "topics": {
-            name: {
-                "schema": topic.schema,
-                "count": topic.sequence.count,
-                "bytes": topic.bytes,
-                "rate_hz": topic.rate_hz,
-                "nominal_hz": topic.nominal_hz or None,
-                "longest_gap_s": None
-                if topic.longest_gap_ns is None
-                else topic.longest_gap_ns / NS_PER_S,
-                "lost": topic.sequence.missing,
-                "gaps": topic.sequence.gaps,
-                "restarts": topic.sequence.restarts,
-            }
-            for name, topic in sorted(survey.topics.items())
-        },
-    }
 
 
 def show(survey: Survey, run_files: list[Path], console: Console) -> None:
@@ -254,28 +223,6 @@ def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
             str(topic.sequence.restarts),
         )
     return table
-
-
-def _file_as_json(file: FileFacts) -> dict[str, Any]:
-    return {
-        "path": str(file.path),
-        "bytes": file.size,
-        "finished": file.finished,
-        "in_use": file.in_use,
-        "profile": file.profile,
-        "library": file.library,
-        "messages": file.messages,
-        "start_ns": file.first_ns if file.messages else None,
-        "end_ns": file.last_ns if file.messages else None,
-        "orphans": file.orphans,
-        "passed_over": file.passed_over,
-        "counted": file.counted,
-        "earlier_ends": file.earlier_ends,
-        "cut": file.cut and file.cut._asdict(),
-        "damage": [loss._asdict() for loss in file.damage],
-        "attachments": file.attachments,
-        "metadata": file.metadata,
-    }
 
 
 def _seconds(first_ns: int, last_ns: int) -> float:
