@@ -13,7 +13,6 @@ import signal
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 from shared.bus.sockets import established
 from shared.run_directory import FLEET_VARIABLE
@@ -81,23 +80,10 @@ def connected(pid: int) -> set[tuple[str, int]]:
     return established(inodes, Path(f"/proc/{pid}/net")) if inodes else set()
 
 
-class ProcessUse(NamedTuple):
-    """What a process has used so far."""
-
-    cpu_s: float
-    memory_mib: float
-
-
-def use_of(pids: Iterable[int]) -> dict[int, ProcessUse]:
-    """Return what processes have used; one that has ended is left out."""
-    found = {}
-    for pid in pids:
-        fields = _stat(pid)
-        if fields:
-            ticks, pages = int(fields[11]) + int(fields[12]), int(fields[21])
-            memory_mib = pages * os.sysconf("SC_PAGE_SIZE") / (1 << 20)
-            found[pid] = ProcessUse(ticks / _TICKS_PER_S, memory_mib)
-    return found
+def cpu_s_of(pids: Iterable[int]) -> dict[int, float]:
+    """Return the processor time that processes have used; one that has ended is left out."""
+    fields = {pid: _stat(pid) for pid in pids}
+    return {pid: (int(f[11]) + int(f[12])) / _TICKS_PER_S for pid, f in fields.items() if f}
 
 
 def uptime_s(pid: int) -> float:

@@ -356,7 +356,7 @@ class SupervisedFleet:
         pids = [pid for name, pid in self.pids().items() if name in services]
         if not pids and self._process is not None:
             pids = [self._process.pid]
-        return sum(use.cpu_s for use in procfs.use_of(pids).values())
+        return sum(procfs.cpu_s_of(pids).values())
 
     def _info_or_none(self) -> list[ServiceInfo]:
         """Return every service; none while the supervisor is still starting."""

@@ -100,9 +100,9 @@ class CpuMeter:
     def sample(self, pids: Iterable[int]) -> None:
         """Add what each process has used since the sample before."""
         self._end_s = time.monotonic()
-        for pid, use in procfs.use_of((*pids, os.getpid())).items():
-            self._spent_s += use.cpu_s - self._last.get(pid, use.cpu_s)
-            self._last[pid] = use.cpu_s
+        for pid, cpu_s in procfs.cpu_s_of((*pids, os.getpid())).items():
+            self._spent_s += cpu_s - self._last.get(pid, cpu_s)
+            self._last[pid] = cpu_s
 
     @property
     def share_pct(self) -> float:
