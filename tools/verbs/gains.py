@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import Annotated, Final
 
-import msgspec
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -20,12 +19,10 @@ from shared.places import refuse_shipped
 from tools.flags import ConfigFlags, option
 from tools.lab.design import split_program
 from tools.lab.design.dynamic_certificate import BLIND, BLIND_S, HELD, TRACK, DynamicCertificate
-from tools.lab.design.push_limit import DIRECTIONS, equivalent_slope
 from tools.terminal import Console
 
 ROOM_EVERY = 5
 """Every n-th pose is judged for what is printed."""
-PUSH_HEIGHTS = 4
 SHOWN = 6
 """Heights in the printed table."""
 
@@ -102,39 +99,10 @@ def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
         table.add_row(f"{schedule.z[i]:.3f}", *(f"{value:.0f}" for value in row))
     console.print(table)
     _show_damping(robot, schedule, console)
-    _show_pushes(robot, schedule, console)
     margins = split_program.smallest_margins(robot, schedule)
     console.print(
         f"smallest margin, nodes and half way between: {margins.service:.2f} of what is "
         f"required with the joint services alone, {margins.onboard:.2f} with the drives alone"
-    )
-
-
-def _show_pushes(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
-    """Print how hard a constant push each tier holds, upright."""
-    table = Table(title="Hardest constant push, N: led, if it grows / planner dead / drives / body")
-    table.add_column("COM m", justify="right")
-    for name in DIRECTIONS:
-        table.add_column(name, justify="right", no_wrap=True)
-    parts = list[str]()
-    least = dict.fromkeys(DIRECTIONS, math.inf)
-    ready = msgspec.structs.replace(robot, gain_schedule=schedule)
-    for z, limits in split_program.push_limits(ready, PUSH_HEIGHTS):
-        cells = [" / ".join(f"{limit.force_n:.0f}" for limit in row) for row in limits.values()]
-        table.add_row(f"{z:.3f}", *cells)
-        parts += [row.held.part for row in limits.values()]
-        for name, row in limits.items():
-            least[name] = min(least[name], row.held.force_n, row.led.force_n)
-    console.print(table)
-    first = ", ".join(dict.fromkeys(parts))
-    console.print(f"gives way first, with the planner dead: {first}", style="dim")
-    slopes = ", ".join(
-        f"{math.degrees(equivalent_slope(robot, force_n)):.1f} degrees {name}"
-        for name, force_n in least.items()
-    )
-    console.print(f"slope without an IMU, planner dead or led: {slopes}", style="dim")
-    console.print(
-        "body: what soles and motors bear at that pose, whatever the control", style="dim"
     )
 
 

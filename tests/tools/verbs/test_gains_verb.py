@@ -52,7 +52,7 @@ def test_a_schedule_for_no_payload_is_written_beside_the_robot_file(
     gain_schedule.require(robot, path)
 
 
-def test_margins_above_what_the_planner_asks_for_and_the_hardest_pushes_are_printed(
+def test_margins_above_what_the_planner_asks_for_are_printed(
     unladen: tuple[Path, str],
 ) -> None:
     path, said = unladen
@@ -64,10 +64,6 @@ def test_margins_above_what_the_planner_asks_for_and_the_hardest_pushes_are_prin
     assert found, said
     assert float(found[1]) > certificate.margin_min
     assert float(found[2]) > certificate.onboard_margin_min
-    assert re.search(r"slope without an IMU.*\d\.\d degrees forwards", said)
-    rows = re.findall(r"^ *\d\.\d{3} +(.*)", said.split("Hardest constant push")[1], re.M)
-    assert rows
-    assert all(re.search(r"\d+ / \d+", row) for row in rows), rows
 
 
 def test_a_lighter_robot_is_held_more_softly(unladen: tuple[Path, str]) -> None:

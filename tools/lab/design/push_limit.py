@@ -293,15 +293,6 @@ def limits_along(
     )
 
 
-def equivalent_slope(config: RobotConfig, force_n: float) -> float:
-    """Return the floor slope, rad, that pulls the weight downhill as hard as a push (N).
-
-    Without an IMU the planner stands along the floor's normal, and the weight loads the gains like
-    a push at the torso. The real load is somewhat smaller, because a third of the mass hangs lower.
-    """
-    return math.asin(min(1.0, force_n / (config.total_mass * GRAVITY)))
-
-
 def _limits(config: RobotConfig) -> list[_Limit]:
     """Return the limits of every motor pair, sole edge and sole friction."""
     limits: list[_Limit] = []

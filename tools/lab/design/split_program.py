@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -50,7 +50,6 @@ from tools.lab.design.dynamic_certificate import (
     nodes_of,
 )
 from tools.lab.design.poses import BoundsOverPoses, PoseNode, Poses, geometric_stiffness
-from tools.lab.design.push_limit import PushLimits, limits_at, stand_at
 
 if TYPE_CHECKING:
     import cvxpy as cp
@@ -172,18 +171,6 @@ def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
                 service = min(service, margins.service)
                 onboard = min(onboard, margins.onboard)
     return Margins(service, onboard)
-
-
-def push_limits(config: RobotConfig, heights: int) -> Iterator[tuple[float, dict[str, PushLimits]]]:
-    """Yield COM heights, m, over the schedule's range, and the push limits there, upright."""
-    schedule = config.gain_schedule
-    assert schedule is not None  # noqa: S101 - the caller has just computed it
-    poses, scheduled = Poses(config), ScheduledGains(schedule)
-    for z in np.linspace(schedule.z[0], schedule.z[-1], heights):
-        stand = stand_at(config, poses, float(z), 0.0)
-        if stand is not None:
-            D = scheduled.at(float(z), 0.0)
-            yield float(z), limits_at(stand, config, D, scheduled.D_B)
 
 
 def _with_midpoints(nodes: Array) -> Array:

@@ -15,11 +15,11 @@ from services.simulator.physics.body import body_of
 from services.simulator.physics.plant import NAMED, changed
 from services.simulator.physics.world import World
 from shared.arrays import Array
-from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
-from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, equivalent_slope, stand_at
+from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, stand_at
 from tools.lab.studies.sweeps.plants import com_height
 
 HEIGHTS = (0.7, 0.8, 0.9)
@@ -173,9 +173,3 @@ def test_an_integral_bears_its_part_of_a_push_from_the_side_as_the_body_shares_l
         assert led[0] == held < led[1] < led[2] < led[3]
         assert led[3] == stand.limit_held(SOFT, side, K_c + rigid).force_n
         assert stand.limit_led(SOFT, ahead, K_c, 60.0) == stand.limit_held(SOFT, ahead, K_c)
-
-
-def test_a_slope_pulls_by_its_sine_of_the_weight(robot: RobotConfig) -> None:
-    weight = robot.total_mass * GRAVITY
-    assert equivalent_slope(robot, weight * math.sin(0.07)) == pytest.approx(0.07)
-    assert equivalent_slope(robot, 2.0 * weight) == pytest.approx(math.pi / 2)
