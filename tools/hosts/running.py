@@ -14,8 +14,7 @@ from shared.exceptions import FleetError
 from shared.joints import MODULES
 from tools.fleet.fleet_status import FleetStatus, ModuleStatus
 from tools.hosts.hosts_file import Hosts
-from tools.hosts.installation import is_up
-from tools.hosts.layout import RUN_DIR, UNIT
+from tools.hosts.layout import RUN_DIR, UNIT, is_up
 from tools.hosts.remote import Remote
 
 HEARD_S: Final = 10.0

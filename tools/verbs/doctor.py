@@ -14,7 +14,7 @@ from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, DriveError, FleetError, MissingPackageError
 from shared.joints import MODULES
-from tools.bringup import check_board, check_can, check_host
+from tools.bringup import can_monitor, check_board, check_host
 from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
 from tools.bringup.can_monitor import BusTraffic, bus_nodes, listen_to
 from tools.bringup.drive_access import (
@@ -109,10 +109,10 @@ def survey(
         groups[CAN] = []
         for module in MODULES:
             heard = traffic[robot.module_named(module).bus]
-            groups[CAN] += check_can.drive_rows(robot, module, heard, services_up=services_up)
-    groups[HARNESS] = check_can.harness_rows(robot, traffic[robot.harness.bus])
+            groups[CAN] += can_monitor.drive_rows(robot, module, heard, services_up=services_up)
+    groups[HARNESS] = can_monitor.harness_rows(robot, traffic[robot.harness.bus])
     if robot.imu.fitted:
-        groups[IMU] = check_can.imu_rows(robot, traffic[robot.imu.bus])
+        groups[IMU] = can_monitor.imu_rows(robot, traffic[robot.imu.bus])
     return {name: groups[name] for name in GROUPS if name in groups}
 
 
@@ -170,7 +170,7 @@ class _Usb:
     def _position(self, module: str, board: Board | None) -> list[Finding]:
         """Judge where a module is, by its bus if it is on one, else by its board."""
         bus = self._traffic.get(self._robot.module_named(module).bus)
-        turns = check_can.positions(self._robot, module, bus) if bus else None
+        turns = can_monitor.positions(self._robot, module, bus) if bus else None
         if turns is None and board is not None:
             try:
                 names = [f"{axis}.encoder.pos_estimate" for axis in drive_settings.AXES]

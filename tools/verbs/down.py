@@ -12,8 +12,7 @@ from tools.bringup.zero_record import rests_after_down
 from tools.flags import Arg, Duration, RunDirFlags
 from tools.fleet import procfs
 from tools.fleet.supervise import SupervisedFleet
-from tools.live.descent import WAYS
-from tools.live.lowering import lower
+from tools.live.descent import WAYS, lower
 
 EXAMPLES: Final = """
 xrl down                      # a robot that bears weight goes down first, and waits to be hung

@@ -17,9 +17,9 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, FleetError, RunError
 from tools.flags import ConfigFlags, Duration, Folder, option, positional
 from tools.fleet.status_table import tables
-from tools.hosts import hosts_file, installation, running
+from tools.hosts import hosts_file, layout, running
 from tools.hosts.hosts_file import Hosts
-from tools.hosts.installation import HostFile, HostRow
+from tools.hosts.layout import HostFile, HostRow
 from tools.hosts.remote import Remote, on_all
 from tools.keys import authority as authorities
 from tools.keys.authority import Authority
@@ -102,7 +102,7 @@ class _Given(NamedTuple):
             raise RunError(f"{gain_schedule.path_beside(config)}: {error.strerror}") from None
         authority = self.authority()
         return {
-            remote.host.name: installation.files_of(
+            remote.host.name: layout.files_of(
                 self.hosts, remote.host, self.robot, schedule, authority
             )
             for remote in self.remotes
@@ -147,7 +147,7 @@ def update(flags: UpdateFlags) -> int:
 
     def one(remote: Remote) -> str:
         mine = files[remote.host.name]
-        return installation.update(given.hosts, remote, mine, while_up=flags.while_up)
+        return layout.update(given.hosts, remote, mine, while_up=flags.while_up)
 
     return _each(given, one)
 
@@ -210,7 +210,7 @@ def check(flags: HostsFlags) -> int:
     files = given.files()
     found = on_all(
         given.remotes,
-        lambda remote: installation.check(given.hosts, remote, files[remote.host.name]),
+        lambda remote: layout.check(given.hosts, remote, files[remote.host.name]),
     )
     rows = [
         HostRow(name, wrong=(str(row),)) if isinstance(row, FleetError) else row
@@ -218,7 +218,7 @@ def check(flags: HostsFlags) -> int:
     ]
     console = Console()
     console.print(_table(rows))
-    others = installation.disagreements(rows)
+    others = layout.disagreements(rows)
     for text in others:
         console.print(marked("[bold red]{}[/]", text))
     return FAULT_EXIT_CODE if others or any(row.wrong for row in rows) else 0

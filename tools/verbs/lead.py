@@ -23,7 +23,7 @@ from tools.flags import Arg, RunDirFlags
 from tools.fleet.emergency_stop import BusStop, refuse_going, request_here
 from tools.fleet.supervise import SupervisedFleet
 from tools.keyboard import Keyboard
-from tools.live.lowering import asker, other_asker
+from tools.live.descent import asker, other_asker
 from tools.pads.gamepad import BUTTONS, Gamepad, find_pad
 from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console

@@ -20,11 +20,11 @@ from tools.logs.run_index import RunIndex
 from tools.logs.run_log import robot_of
 from tools.output import progress_along, write_atomically
 from tools.terminal import Console, marked
+from tools.view.frame import Source
 from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource, single_file
 from tools.view.serving import PortFlags, serve
-from tools.view.source import Source
 
 EXAMPLES: Final = """
 xrl view                       # the running fleet, without touching it

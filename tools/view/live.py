@@ -26,8 +26,17 @@ from tools.fleet.emergency_stop import BusStop, request_here
 from tools.fleet.fleet_status import impairments
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.supervise import SupervisedFleet
-from tools.view.frame import SHOWN, Frame, Newest, ShownProcess
-from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source
+from tools.view.frame import (
+    CUT_S,
+    CUTS,
+    SHOWN,
+    Frame,
+    HandOrders,
+    Newest,
+    Order,
+    ShownProcess,
+    Source,
+)
 
 
 class LiveOrders:

@@ -16,8 +16,7 @@ from shared.config.scenarios import Keyframe, Kill, Restart, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from tools.sim.lockstep import Lockstep, begin_standing
-from tools.view.frame import Frame, Newest
-from tools.view.source import CUT_S, CUTS, HandOrders, Order, Source, without_fleet
+from tools.view.frame import CUT_S, CUTS, Frame, HandOrders, Newest, Order, Source, without_fleet
 
 _FOREVER_S: Final = 1e9
 _STEP_S: Final = 0.01

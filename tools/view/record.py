@@ -20,14 +20,16 @@ from shared.exceptions import RunError
 from tools.judge.reports.events import events_of
 from tools.judge.reports.run_data import RunData
 from tools.logs.run_log import NewestAt, RunLog
-from tools.view.frame import SHOWN, Frame, Newest
-from tools.view.source import (
+from tools.view.frame import (
     COURSE_FRAMES,
     FRAMES_S,
     PAGE,
+    SHOWN,
     UPLOT,
+    Frame,
     Mark,
     Model,
+    Newest,
     Source,
     without_fleet,
 )

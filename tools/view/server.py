@@ -18,7 +18,7 @@ import msgspec
 from aiohttp import WSMsgType, web
 
 from shared.exceptions import FleetError, XrlError
-from tools.view.source import FRAMES_S, HOST, PAGE, PORT, UPLOT, Order, Source
+from tools.view.frame import FRAMES_S, HOST, PAGE, PORT, UPLOT, Order, Source
 
 RATES: Final = (0.05, 20.0)
 """Slowest and fastest rate at which a record is played."""

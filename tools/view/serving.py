@@ -23,7 +23,7 @@ from shared.toml_file import Range
 from tools.flags import Arg, Flags
 from tools.fleet.procfs import die_with_parent
 from tools.terminal import Console
-from tools.view.source import HOST, PORT, Source
+from tools.view.frame import HOST, PORT, Source
 
 _END_S = 5.0
 

@@ -20,7 +20,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.sections import CanConfig
 from shared.joints import MODULES
 from tests.tools.bringup.board_in_memory import as_wanted, healthy, with_driver
-from tools.bringup import check_board, check_can
+from tools.bringup import can_monitor, check_board
 from tools.bringup.boards import Value
 from tools.bringup.can_monitor import BusTraffic, NodeTraffic, SensorTraffic
 from tools.bringup.findings import (
@@ -133,7 +133,7 @@ def traffic(**changes: NodeTraffic) -> BusTraffic:
 
 
 def bus(heard: BusTraffic) -> Rows:
-    return lambda robot: check_can.drive_rows(robot, MODULE, heard, services_up=False)
+    return lambda robot: can_monitor.drive_rows(robot, MODULE, heard, services_up=False)
 
 
 def closed(interface: str, trouble: str) -> Rows:
@@ -150,13 +150,13 @@ def cells(rate_hz: float = 250.0, force: float = 20.0, malformed: int = 0) -> Ro
     sample = (force, 0.0, 0.0, 0.0, 0.0, -force)
     heard = SensorTraffic([sample] * 50, times(1.0 / rate_hz, 50))
     whole = BusTraffic(seconds=50 / rate_hz, cells=heard, malformed=malformed)
-    return lambda robot: check_can.harness_rows(robot, whole)
+    return lambda robot: can_monitor.harness_rows(robot, whole)
 
 
 def imu(*, valid: bool = True, period_s: float = 0.01) -> Rows:
     sample = ImuSample((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), valid)
     heard = BusTraffic(frames=150, imu=SensorTraffic([sample] * 50, times(period_s, 50)))
-    return lambda robot: check_can.imu_rows(robot, heard)
+    return lambda robot: can_monitor.imu_rows(robot, heard)
 
 
 def no_sensor(judge: Callable[[RobotConfig, BusTraffic], list[Finding]], **heard: Any) -> Rows:
@@ -166,7 +166,7 @@ def no_sensor(judge: Callable[[RobotConfig, BusTraffic], list[Finding]], **heard
 NEW = axis(FAILED, version=Version(2, (4, 4, 58), (0, 6, 10), 0))
 STRANGERS = BusTraffic(nodes={8: NodeTraffic(), 9: NodeTraffic(), 0: axis(), 1: axis()})
 NO_CAN = f"[Errno {errno.EAFNOSUPPORT}] {os.strerror(errno.EAFNOSUPPORT)}"
-HARNESS, IMU = check_can.harness_rows, check_can.imu_rows
+HARNESS, IMU = can_monitor.harness_rows, can_monitor.imu_rows
 OWN: Changes = {
     module: {
         "axis0.config.can.node_id": 2 * i, "axis0.encoder.config.phase_offset": 1000 * i,
@@ -368,7 +368,7 @@ def test_an_estimate_of_0_is_believed_of_new_firmware_only(
 ) -> None:
     """On a full machine the count's answer came too late, and a zero was called lost."""
     heard = traffic(axis9=NodeTraffic(IDLE, pos_turns=0.0, **answered))
-    found = check_can.positions(robot, MODULE, heard)
+    found = can_monitor.positions(robot, MODULE, heard)
     assert found == (None if turns is None else (64.0, turns))
 
 

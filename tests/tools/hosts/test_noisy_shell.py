@@ -9,7 +9,7 @@ import pytest
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
 from tests.tools.hosts.places import make_hosts
-from tools.hosts import hosts_file, installation
+from tools.hosts import hosts_file, layout
 from tools.hosts.remote import Remote
 
 NOISE = 'echo "Welcome to $1"; echo "17"; printf "no end of line> "'
@@ -41,7 +41,7 @@ def test_a_commands_output_is_its_own(remote: Remote) -> None:
     told: list[str] = []
     remote.follow("printf", "one\\ntwo\\n", tell=told.append)
     assert told == ["body: one", "body: two"]
-    assert installation.is_up(remote) is False
+    assert layout.is_up(remote) is False
 
 
 def test_a_shell_that_does_not_run_the_command_is_an_error(base: Path, robot: RobotConfig) -> None:

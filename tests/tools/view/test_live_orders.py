@@ -16,8 +16,8 @@ from shared.exceptions import FleetError
 from tests.certified import certified, install_all
 from tools.fleet import process_table
 from tools.verbs import view
+from tools.view.frame import Order
 from tools.view.live import LiveOrders, LiveSource
-from tools.view.source import Order
 
 REAL = ("planner", "knee_left", "recorder")
 SIMULATED = ("simulator", *REAL)

@@ -16,9 +16,8 @@ from shared.bus.messages import Mode
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tools.live.experiment import load_robot
-from tools.view.frame import Frame
+from tools.view.frame import Frame, Order
 from tools.view.lockstep import LockstepSource
-from tools.view.source import Order
 
 LIMIT_S = 100.0
 

@@ -15,9 +15,8 @@ from tests.shared.mcap_log.runs import recorded_in_parts
 from tests.tools.judge.reports.runs import changed
 from tools.fleet.stalls import Stall
 from tools.logs.run_log import RunLog, read_run, robot_of
-from tools.view.frame import Newest
+from tools.view.frame import COURSE_FRAMES, Newest, Order
 from tools.view.record import RecordSource
-from tools.view.source import COURSE_FRAMES, Order
 
 LOG = Path(__file__).parents[1] / "logs" / "reexecution" / "golden" / "stand.mcap"
 

@@ -17,10 +17,10 @@ from tests.tools.view.test_record_source import LOG
 from tools import cli
 from tools.live.experiment import load_robot
 from tools.logs.run_log import read_run, robot_of
+from tools.view.frame import Source
 from tools.view.lockstep import LockstepSource
 from tools.view.record import RecordSource
 from tools.view.server import ViewServer
-from tools.view.source import Source
 
 pytestmark = [
     pytest.mark.skipif(BROWSER is None, reason="needs a Chromium"),

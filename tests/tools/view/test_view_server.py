@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
-from tools.view.frame import Frame
+from tools.view.frame import Frame, Model, Order, Source
 from tools.view.server import (
     CLIENTS_MAX,
     MESSAGE_MAX,
@@ -27,7 +27,6 @@ from tools.view.server import (
     TimelineCursor,
     ViewServer,
 )
-from tools.view.source import Model, Order, Source
 
 TOKEN = "known-to-this-test"  # noqa: S105 - of a server that ends with its test
 

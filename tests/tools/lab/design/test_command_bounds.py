@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from tools.lab.design.body_stiffness import body_stiffness, for_robot
 
 from services.joint.envelope import Envelope
 from services.planner.intents import OperatorRequest
@@ -13,7 +14,6 @@ from shared.bus.messages import Outside
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tests.planner.states import SESSION, START_NS, closed, receive_all
-from tools.lab.design.body_stiffness import body_stiffness, for_robot
 
 ROUNDING = 1e-3
 """The paper rounds theta_edge to 0.0490 and g to 9.8 on the way."""
