@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from services.simulator.drives.axis_bank import AxisBank
-from services.simulator.drives.axis_settings import preset
 from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.fibre_front import EmulatedBoard, FibreFront
 from services.simulator.fronts.fibre_port import FibreHub, FibrePort
@@ -23,7 +22,7 @@ from shared.bus.traces import SimState, SimTruth
 from shared.config import files as config_file
 from shared.config import scenarios
 from shared.config.robot_config import RobotConfig, expand
-from shared.joints import MODULE_INDEX, N_JOINTS
+from shared.joints import MODULE_INDEX
 from shared.places import SCENARIOS
 from shared.process import StopFlag, freeze_garbage, run_service, service_parser
 from shared.run_directory import live_dir, make_live_dir
@@ -43,14 +42,6 @@ def main() -> int:
         type=float,
         metavar="S",
         help="start the scenario S seconds after the hoist is down (default: at a bus message)",
-    )
-    parser.add_argument(
-        "--drive-setting",
-        action="append",
-        default=[],
-        metavar="MODULE.NAME=VALUE",
-        help="a setting that a drive has kept, as knee_left.axis0.controller.config.vel_limit=2; "
-        "may be given several times",
     )
     parser.add_argument(
         "--plant",
@@ -99,10 +90,6 @@ def main() -> int:
             heartbeat_period_ms=robot.drive.heartbeat_period_ms,
             dialect=robot.simulation.can_dialect,
         )
-        for words in arguments.drive_setting:
-            preset(made.bank.settings, words)
-        for axis in range(N_JOINTS if arguments.drive_setting else 0):
-            made.bank.calibration.restart(axis)
         usb = open_usb(robot, made.bank, arguments.run_dir, stack)
         logger.info("up, %s, scenario %s", granted, scenario.name)
         freeze_garbage()

@@ -20,7 +20,6 @@ from services.simulator.drives.axis_settings import (
     PHASE_RESISTANCE,
     Settings,
     configured,
-    preset,
 )
 from shared.can.cansimple import Command, arbitration_id, pack_input_pos, pack_two_floats
 from shared.can.drive_settings import (
@@ -151,6 +150,9 @@ def test_a_planted_setting_is_kept_by_that_drive_alone() -> None:
     preset(settings, "knee_left.axis1.config.enable_watchdog=TRUE")
     preset(settings, "hip_left.config.dc_max_positive_current=inf")
     index = MODULES.index("knee_left")
+    settings.set(index, period, 7)
+    settings.save(index)
+    settings.set(index, period, 8)
     settings.restore(index)
     assert settings.get(index, "axis0.config.can.encoder_rate_ms") == 7
     assert settings.get(index, "axis1.config.enable_watchdog") is True

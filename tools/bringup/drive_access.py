@@ -16,11 +16,10 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-from services.simulator.drives.axis_settings import Settings, preset
 from services.simulator.fronts import usb_standin
 from shared import places
 from shared.config import files as config_file
@@ -30,7 +29,7 @@ from shared.extras import require
 from shared.joints import MODULES
 from tools.bringup.boards import FoundBoards
 from tools.bringup.can_monitor import bus_config, listen
-from tools.flags import Arg, Flags, FleetRobotFlags
+from tools.flags import FleetRobotFlags
 from tools.fleet import procfs
 from tools.fleet.process_table import FleetOptions, is_simulated, refuse_half_emulated
 from tools.fleet.run_dir import RunDir
@@ -125,43 +124,18 @@ def confirm(question: str, *, yes: bool) -> bool:
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
 
-class DriveSettingFlags(Flags):
-    """Settings that the emulated drives have kept."""
-
-    plant: Annotated[tuple[str, ...], Arg(metavar="MODULE.NAME=VALUE")] = ()
-    """emulated robot only: a stored setting of a drive, such as
-    knee_left.axis0.controller.config.vel_limit=2; may be given several times"""
-
-
-def check_plants(robot: RobotConfig, run_dir: Path, plants: Sequence[str]) -> None:
-    """Refuse planted settings with which no emulated drive can start."""
-    if not plants:
-        return
-    if not is_simulated(robot):
-        raise FleetError("--plant is for emulated drives; these are real ones")
-    if is_up(run_dir):
-        raise FleetError(
-            f"--plant is for drives that are started for it, and a fleet is up in {run_dir}: "
-            "`xrl down` first, or give another --run-dir"
-        )
-    scratch = Settings()
-    for words in plants:
-        preset(scratch, words)
-
-
 @contextlib.contextmanager
 def drives_within_reach(
     robot: RobotConfig,
     config_path: Path,
     run_dir: Path,
-    plants: Sequence[str] = (),
     *,
     lifted: float = 0.0,
 ) -> Iterator[bool]:
     """Have the drives there for a while; yields True if the simulator was started for it.
 
-    Real drives are there or not; nothing is started for them. A simulator that is started plants
-    settings that its drives have kept, and hangs the robot higher by `lifted`, m.
+    Real drives are there or not; nothing is started for them. A simulator that is started hangs the
+    robot higher by `lifted`, m.
     """
     refuse_half_emulated(robot)
     if not is_simulated(robot):
@@ -169,9 +143,8 @@ def drives_within_reach(
         return
     simulator: SupervisedFleet | None = None
     if not is_up(run_dir):
-        words = [word for planted in plants for word in ("--drive-setting", planted)]
         # a light foot in the air on a damped drivetrain wants a finer step than a standing robot
-        words += ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
+        words = ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
         alone = FleetOptions(
             overrides={"simulator": words},
             no_restart=("simulator",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -18,9 +18,7 @@ from tools.bringup import can_monitor, check_board, check_host
 from tools.bringup.boards import STATUS, Board, FoundBoards, Value, is_known, number
 from tools.bringup.can_monitor import BusTraffic, bus_nodes, listen_to
 from tools.bringup.drive_access import (
-    DriveSettingFlags,
     boards_on_usb,
-    check_plants,
     drives_within_reach,
     is_up,
     robot_file,
@@ -34,7 +32,6 @@ EXAMPLES: Final = """
 xrl doctor
 xrl doctor --config lab.toml --verbose
 xrl doctor --json | jq '.groups[][] | select(.verdict == "wrong")'
-xrl doctor --plant knee_left.axis0.controller.config.vel_limit=2
 """
 
 Progress = Callable[[str], None]
@@ -48,7 +45,7 @@ IMU: Final = "IMU"
 GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 
 
-class DoctorFlags(FleetRobotFlags, DriveSettingFlags):
+class DoctorFlags(FleetRobotFlags):
     """What is shown."""
 
     verbose: bool = False
@@ -61,13 +58,11 @@ def run(flags: DoctorFlags) -> int:
     """Look at everything; 0 if nothing is wrong."""
     path = robot_file(flags)
     robot = config_file.load(path)
-    check_plants(robot, flags.run_dir, flags.plant)
     with Console(stderr=True).status("looking") as status:
         groups = survey(
             robot,
             path,
             flags.run_dir,
-            flags.plant,
             lambda words: status.update(Text(f"looking at {words}")),
         )
     report = report_of(groups)
@@ -78,9 +73,7 @@ def run(flags: DoctorFlags) -> int:
     return 0 if report.ok else FAULT_EXIT_CODE
 
 
-def survey(
-    robot: RobotConfig, config_path: Path, run_dir: Path, plants: Sequence[str], progress: Progress
-) -> Groups:
+def survey(robot: RobotConfig, config_path: Path, run_dir: Path, progress: Progress) -> Groups:
     """Check everything; if no fleet is up, an emulated robot's simulator runs meanwhile."""
     fleet_is_up = is_up(run_dir)
     progress("this computer, the robot file, the bus")
@@ -96,7 +89,7 @@ def survey(
     over_can = robot.joint_service.driver == "odrive_can"
     if is_simulated(robot) and not fleet_is_up:
         progress("starting the simulator: the drives are emulated, and no fleet is up")
-    with drives_within_reach(robot, config_path, run_dir, plants):
+    with drives_within_reach(robot, config_path, run_dir):
         traffic = {}
         for name in bus_nodes(robot):
             if over_can or name in (robot.harness.bus, robot.imu.bus):

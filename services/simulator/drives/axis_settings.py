@@ -25,11 +25,11 @@ from shared.can import drive_settings
 from shared.can.drive_settings import Need, Value
 from shared.config.sections import DriveConfig
 from shared.exceptions import DriveError
-from shared.joints import MODULE_INDEX, MODULES, N_JOINTS
+from shared.joints import MODULES, N_JOINTS
 
 __all__ = [
     "AXIS_SETTINGS", "DIRECTION", "DRIVE_SETTINGS", "NAMES", "N_DRIVES", "PHASE_INDUCTANCE",
-    "PHASE_RESISTANCE", "POLE_PAIRS", "Settings", "Value", "configured", "preset",
+    "PHASE_RESISTANCE", "POLE_PAIRS", "Settings", "Value", "configured",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -116,8 +116,6 @@ CALIBRATION_CURRENT: Final = 15.0
 """A; set by hand as well: the 10 A as shipped do not turn a knee that hangs on its stop."""
 DIRECTION: Final = 1
 """+1 or -1 by how a motor's phases are wired. Calibration finds it, nobody sets it."""
-
-_TRUTH: Final = {"true": True, "false": False}
 
 
 class Settings:
@@ -229,29 +227,3 @@ def configured(
     for index in range(N_DRIVES):
         settings.save(index)
     return settings
-
-
-def preset(settings: Settings, words: str) -> None:
-    """Set and save one setting of one drive, as a person may have left it.
-
-    The words are MODULE.NAME=VALUE, as "knee_left.axis0.controller.config.vel_limit=2".
-
-    Raises:
-        DriveError: there is no such module or setting, or it cannot have that value.
-    """
-    target, _, text = words.partition("=")
-    module, _, name = target.strip().partition(".")
-    if module not in MODULE_INDEX:
-        near = difflib.get_close_matches(module, MODULES, n=1)
-        hint = f"; the nearest is {near[0]}" if near else f"; one of {', '.join(MODULES)}"
-        raise DriveError(f"{words!r}: no module {module!r}{hint}")
-    drive = MODULE_INDEX[module]
-    default = settings.get(drive, name)
-    text = text.strip().lower()
-    try:
-        value = _TRUTH[text] if isinstance(default, bool) else float(text)
-    except (KeyError, ValueError):
-        kind = "true or false" if isinstance(default, bool) else "a number"
-        raise DriveError(f"{words!r}: {name} = {text!r}; it wants {kind}") from None
-    settings.set(drive, name, value)
-    settings.save(drive)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import signal
 import socket
@@ -32,6 +31,7 @@ from tools.bringup.boards import (
     changes_to_wanted,
     read_backup,
     settings_of,
+    write_backup,
 )
 from tools.bringup.motion_runner import Interrupts
 from tools.fleet import procfs
@@ -40,7 +40,6 @@ from tools.terminal import Console
 from tools.verbs.drive import configure
 
 VEL_LIMIT = "axis0.controller.config.vel_limit"
-REGEN = "config.dc_max_negative_current"
 MODULE = "knee_left"
 SERIAL = "3A0000000005"
 
@@ -95,37 +94,29 @@ def verb(run_dir: Path, out: Path, *arguments: str) -> subprocess.CompletedProce
 
 @pytest.mark.system
 @pytest.mark.timeout(180)
-def test_traps_are_taken_out_and_a_backup_brings_them_back(run_dir: Path, tmp_path: Path) -> None:
-    plants = [f"--plant={MODULE}.{VEL_LIMIT}=2", f"--plant=hip_right.{REGEN}=-0.01"]
-    result = verb(run_dir, tmp_path, "--apply", *plants)
+def test_settings_are_written_after_a_backup_of_all_and_kept(run_dir: Path, tmp_path: Path) -> None:
+    file = tmp_path / "changed.json"
+    board = BoardBackup(MODULE, SERIAL, "0.5.6", {VEL_LIMIT: 50.0})
+    write_backup(file, [board], time="", robot_file="")
+    result = verb(run_dir, tmp_path / "b", "--restore", str(file), "--apply")
     assert result.returncode == 0, result.stdout + result.stderr
-    assert "2 settings written" in result.stdout
-    assert "hip_right, knee_left; `xrl drive zero`" in result.stdout
-    (file,) = tmp_path.glob("*.json")
-    kept = {board["module"]: board for board in json.loads(file.read_text())["boards"]}
-    assert list(kept) == list(MODULES)
-    assert kept[MODULE]["settings"][VEL_LIMIT] == 2.0
-    assert kept[MODULE]["serial_number"] == SERIAL
-    assert len(kept[MODULE]["settings"]) > 60, "all settings, not those that are changed"
-
-    back = verb(run_dir, tmp_path / "2", "--restore", str(file), "--module", MODULE, "--apply")
-    assert back.returncode == 0, back.stdout + back.stderr
-    assert "1 settings written" in back.stdout
-    assert "hip_right" not in back.stdout
+    assert "1 settings written" in result.stdout
+    assert f"unzeroed: {MODULE}; `xrl drive zero`" in result.stdout
+    (kept,) = (tmp_path / "b").glob("*.json")
+    (before,) = read_backup(kept).boards
+    assert (before.module, before.serial_number) == (MODULE, SERIAL)
+    assert before.settings[VEL_LIMIT] == 60.0
+    assert len(before.settings) > 60, "all settings, not those that are changed"
 
 
 @pytest.mark.system
 @pytest.mark.wide
 @pytest.mark.timeout(180)
-def test_an_axis_that_is_not_calibrated_is_led_through_it_and_no_other(
-    run_dir: Path, tmp_path: Path
-) -> None:
-    plant = f"--plant={MODULE}.axis1.encoder.config.pre_calibrated=false"
-    asked = ["--apply", "--calibrate", "--yes", "--module", MODULE]
-    result = verb(run_dir, tmp_path, *asked, plant)
+def test_a_board_is_led_through_its_calibration_and_no_other(run_dir: Path, tmp_path: Path) -> None:
+    asked = ["--apply", "--calibrate", "--again", "--yes", "--module", MODULE]
+    result = verb(run_dir, tmp_path, *asked)
     assert result.returncode == 0, result.stdout + result.stderr
     assert f"{MODULE}.axis1: 0.1 ohm, 50 uH, direction 1" in result.stdout
-    assert f"{MODULE}.axis0" not in result.stdout
     assert f"without a zero: {MODULE}; next `xrl drive zero`" in result.stdout
 
 

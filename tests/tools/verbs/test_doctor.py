@@ -18,9 +18,9 @@ import pytest
 from shared.can import cansimple
 from shared.can.cansimple import Command
 from shared.can.cansimple_06 import Command06
-from shared.places import CHECKOUT, DEFAULT_CONFIG
+from shared.places import CHECKOUT
 from shared.run_directory import live_dir
-from tests.system.fleets import command, xrl
+from tests.system.fleets import command
 from tools import cli
 from tools.bringup.findings import ok, wrong
 from tools.fleet import procfs
@@ -31,16 +31,6 @@ pytestmark = [pytest.mark.system, pytest.mark.timeout(180)]
 MODULE = "knee_left"
 AXIS = f"{MODULE}.axis0"
 DIRECTION = "encoder.config.direction"
-TRAPS = {
-    DIRECTION: ("-1", "1"),
-    "controller.config.vel_limit": ("2", "60"),
-    "config.can.encoder_rate_ms": ("10", "2"),
-    "controller.config.vel_integrator_gain": ("0.333", "0"),
-}
-PRE_CALIBRATED = "motor.config.pre_calibrated"
-RAW = f"{MODULE}.axis1.{PRE_CALIBRATED}"
-ODD = "hip_left.axis1.motor.config.pole_pairs"
-"""One board has another number than the others."""
 MEASURED = ("heartbeat", "encoder frames", "load cells", "processors")
 """What depends on how busy the machine is: a full one may find any of it wrong."""
 START_S = 60.0
@@ -51,11 +41,6 @@ def run_dir(run_dir: Path) -> Iterator[Path]:
     yield run_dir
     assert procfs.fleet_pids(run_dir) == set(), "no process is left"
     assert not run_dir.exists(), "and no file"
-
-
-def doctor(run_dir: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the verb in a process of its own: the stand-in of libusb is for a whole process."""
-    return xrl("doctor", *arguments, run_dir=run_dir, timeout_s=170.0)
 
 
 def rows_of(result: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -144,24 +129,6 @@ def test_nothing_is_wrong_with_the_robot_as_shipped_and_it_is_asked_questions_on
         assert command in (Command06.GET_VERSION, Command.GET_VBUS, Command.GET_ENCODER_COUNT)
 
 
-def test_each_planted_trap_is_named_and_nothing_else(run_dir: Path) -> None:
-    plants = [f"--plant={AXIS}.{name}={found}" for name, (found, _) in TRAPS.items()]
-    result = doctor(run_dir, "--json", *plants, f"--plant={RAW}=false", f"--plant={ODD}=20")
-    named = {(row["subject"], row["what"]): row for row in bad_rows_of(result, "wrong")}
-    calibrated = named.pop((f"{MODULE}.axis1", "calibrated"))
-    assert calibrated["fix"] == named.pop((f"{MODULE}.axis1", PRE_CALIBRATED))["fix"]
-    assert {what: (row["found"], row["wanted"]) for (_, what), row in named.items()} == TRAPS
-    assert {subject for subject, _ in named} == {AXIS}
-    assert "two of the motor's phases" in named.pop((AXIS, DIRECTION))["fix"]
-    assert {row["fix"] for row in named.values()} == {
-        "`xrl drive configure --apply --module knee_left`"
-    }
-    (odd,) = bad_rows_of(result, "warning")  # nothing that is wanted is missing there
-    assert (f"{odd['subject']}.{odd['what']}", odd["found"]) == (ODD, "20")
-    periods = [row for row in rows_of(result) if row["what"] == "encoder frames"]
-    assert next(row for row in periods if row["subject"] == AXIS)["verdict"] != "ok"
-
-
 def test_the_terminal_ends_in_what_is_wrong(
     run_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,14 +151,3 @@ def test_ctrl_c_stops_the_simulator_that_was_started(run_dir: Path) -> None:
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors.decode()
     assert b"Traceback" not in errors
-
-
-def test_nothing_is_planted_in_real_drives(
-    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = DEFAULT_CONFIG.read_text(encoding="utf-8").replace('"xrl_unix"', '"socketcan"')
-    real = tmp_path / "real.toml"
-    real.write_text(text, encoding="utf-8")
-    plant = f"--plant={AXIS}.controller.config.vel_limit=2"
-    assert cli.main(["doctor", "--config", str(real), "--run-dir", str(run_dir), plant]) == 2
-    assert "real ones" in capsys.readouterr().err

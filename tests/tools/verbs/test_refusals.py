@@ -91,8 +91,6 @@ REFUSALS: Final = {
     "drive configure --restore none.json": "none.json",
     "drive configure --apply --again": "--again and --yes go with --calibrate",
     "drive configure --calibrate --restore none.json": "leave --restore out",
-    "doctor --plant knee_left.axis0.vel_limit=2": "nearest is axis0.controller.config.vel_limit",
-    "doctor --plant knee_lft.axis0.controller.config.vel_limit=2": "the nearest is knee_left",
     "drive identify": "one of the arguments MODULE --all is required",
     "drive identify --all knee_left": "not allowed with",
     "drive identify shin_left": "shin_left: one of ankle_right",

@@ -37,9 +37,7 @@ from tools.bringup.boards import (
 )
 from tools.bringup.check_host import joint_services_up
 from tools.bringup.drive_access import (
-    DriveSettingFlags,
     boards_on_usb,
-    check_plants,
     drives_within_reach,
     no_fleet_meanwhile,
 )
@@ -59,7 +57,7 @@ xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
 """
 
 
-class ConfigureFlags(FleetRobotFlags, DriveSettingFlags):
+class ConfigureFlags(FleetRobotFlags):
     """Which drives, what is written, and where the backup goes."""
 
     dry_run: Annotated[
@@ -102,7 +100,6 @@ def run(flags: ConfigureFlags) -> int:
     robot = config_file.load_without_schedule(path)
     saved = read_backup(flags.restore) if flags.restore else None
     modules = modules_of(flags, robot, saved)
-    check_plants(robot, flags.run_dir, flags.plant)
     looked_at = MODULES if flags.calibrate else modules
     with contextlib.ExitStack() as stack:
         if flags.apply:
@@ -110,7 +107,7 @@ def run(flags: ConfigureFlags) -> int:
             refuse_services(robot, flags.run_dir, looked_at)
         lifted = LIFTED if flags.calibrate else 0.0
         started = stack.enter_context(
-            drives_within_reach(robot, path, flags.run_dir, flags.plant, lifted=lifted)
+            drives_within_reach(robot, path, flags.run_dir, lifted=lifted)
         )
         found = stack.enter_context(boards_on_usb(robot, flags.run_dir, looked_at))
         boards = boards_of(robot, modules, found)
