@@ -28,7 +28,6 @@ from tools.verbs import doctor
         ("bench fleet", "sim"),
         ("gains", "design"),
         ("view", "view"),
-        ("view OUT", "view"),
         ("view --sim", "sim"),
         ("up --run-dir run --out o", "sim"),
         ("up --run-dir run --out o --no-sim --ros2", "ros2"),

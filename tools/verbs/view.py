@@ -18,19 +18,19 @@ from tools.judge.run_parts import PartFlags, read_asked
 from tools.live.experiment import load_robot
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import robot_of
-from tools.output import progress_along, write_atomically
+from tools.output import progress_along, refuse_taken, write_atomically
 from tools.terminal import Console, marked
 from tools.view.frame import Source
 from tools.view.live import LiveSource
 from tools.view.lockstep import LockstepSource
-from tools.view.record import RecordSource, single_file
+from tools.view.record import RecordFrames, single_file
 from tools.view.serving import PortFlags, serve
 
 EXAMPLES: Final = """
 xrl view                       # the running fleet, without touching it
 xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
-xrl view out/demo/run.mcap     # a record: play, pause, step, scrub
-xrl view out/demo/run.mcap --html run.html     # ... as one file that opens anywhere
+xrl view out/demo/run.mcap     # writes a record as one page: play, pause, step, scrub
+xrl view out/demo/run.mcap --html run.html
 xrl view --sim                 # a robot in this process: lead it, push it, kill its planner
 """
 
@@ -42,7 +42,7 @@ class ViewFlags(PortFlags, PartFlags, RunDirFlags):
     sim: bool = False
     """simulate a robot in this process, in virtual time"""
     html: Path | None = None
-    """write the record into one HTML file that needs no server, and end"""
+    """with a record: path of its page, which needs no server (default: NAME.view.html beside it)"""
     act: bool = False
     """let the page act on the running fleet; for a real robot you type its name first"""
     config: Annotated[Path | None, robot_file_of("that of the record or of the fleet")] = None
@@ -64,9 +64,9 @@ def run(flags: ViewFlags) -> int:
     """Serve until Ctrl-C."""
     if flags.sim:
         require("sim")
-    if flags.html is not None:
-        return _write(flags, flags.html)
-    require("view", "write it as one page: --html FILE" if flags.record is not None else "")
+    if flags.record is not None:
+        return _write(flags, RunIndex(flags.record))
+    require("view")
     with _source(flags) as source:
         serve(source, flags.port)
     return 0
@@ -80,9 +80,6 @@ def _source(flags: ViewFlags) -> Iterator[Source]:
             yield lockstep
         finally:
             lockstep.close()
-    elif flags.record is not None:
-        log = read_asked(flags, RunIndex(flags.record))
-        yield RecordSource(log, robot_of(log))
     else:
         fleet = SupervisedFleet.attach(flags.run_dir)
         robot = fleet.manifest.robot()
@@ -95,16 +92,17 @@ def _source(flags: ViewFlags) -> Iterator[Source]:
             live.disconnect()
 
 
-def _write(flags: ViewFlags, out: Path) -> int:
+def _write(flags: ViewFlags, index: RunIndex) -> int:
     """Write a record into one file."""
-    assert flags.record is not None  # noqa: S101 - `check` asks for it
-    log = read_asked(flags, RunIndex(flags.record))
-    source = RecordSource(log, robot_of(log))
-    model = source.model()
-    with progress_along("frames", model.end_s - model.begin_s) as done:
-        content = single_file(source, done)
+    log = read_asked(flags, index)
+    record = RecordFrames(log, robot_of(log))
+    length_s = record.model.end_s - record.model.begin_s
+    with progress_along("frames", length_s) as done:
+        content = single_file(record, done)
+    out = flags.html or index.files[0].with_suffix(".view.html")
+    refuse_taken(out, index.files[0], force=True)
     write_atomically(out, content)
-    print(f"{out}: {model.end_s - model.begin_s:.1f} s, {len(content) / 1e6:.1f} MB")
+    print(f"{out}: {length_s:.1f} s, {len(content) / 1e6:.1f} MB; open it in a browser")
     return 0
 
 

@@ -291,8 +291,6 @@ def _vector(values: Iterable[float]) -> Vector3:
     return x, y, z
 
 
-COURSE_FRAMES: Final = 300
-"""Frames of a record's course: a point for each pixel of a plot."""
 HOST: Final = "127.0.0.1"
 PORT: Final = 8417
 FRAMES_S: Final = 30.0
@@ -380,12 +378,27 @@ class Model(msgspec.Struct, frozen=True):
     end_s: float = 0.0
     """A record's end on its timeline; equal to `begin_s`: there is no timeline."""
     marks: tuple[Mark, ...] = ()
-    course: tuple[Frame, ...] = ()
-    """A record from its beginning to its end, for the plots."""
+
+
+def model_of(robot: RobotConfig, kind: str, title: str) -> Model:
+    """Return what does not change of a robot."""
+    geometry = robot.geometry
+    still = {row.child: row for row in body_frames(geometry, (0.0,) * len(JOINTS))}
+    return Model(
+        robot=robot.name,
+        source=kind,
+        title=title,
+        modules=MODULES,
+        modes={int(mode): mode.name for mode in Mode},
+        joints={name: (still[name].parent, still[name].position) for name in MODULES},
+        bodies=bodies_of(robot),
+        harness=geometry.harness_point,
+        foot=(geometry.l_foot, geometry.w_foot, geometry.foot_height),
+    )
 
 
 class Source(ABC):
-    """Frames of one robot."""
+    """Frames of one robot that moves now."""
 
     kind: str
     title: str
@@ -397,21 +410,8 @@ class Source(ABC):
 
     def model(self) -> Model:
         """Return what does not change."""
-        geometry = self.robot.geometry
-        still = {row.child: row for row in body_frames(geometry, (0.0,) * len(JOINTS))}
-        return Model(
-            robot=self.robot.name,
-            source=self.kind,
-            title=self.title,
-            modules=MODULES,
-            modes={int(mode): mode.name for mode in Mode},
-            joints={name: (still[name].parent, still[name].position) for name in MODULES},
-            bodies=bodies_of(self.robot),
-            harness=geometry.harness_point,
-            foot=(geometry.l_foot, geometry.w_foot, geometry.foot_height),
-            orders=self.orders,
-            processes=self.processes,
-        )
+        model = model_of(self.robot, self.kind, self.title)
+        return msgspec.structs.replace(model, orders=self.orders, processes=self.processes)
 
     def connect(self) -> None:
         """Begin to listen: somebody looks. May block for a moment."""
@@ -422,12 +422,12 @@ class Source(ABC):
         return
 
     @abstractmethod
-    def frame(self, t_s: float) -> Frame | None:
-        """Return the newest frame, or of a record that at a time of its timeline; None: not yet."""
+    def frame(self) -> Frame | None:
+        """Return the newest frame; None: not yet."""
 
+    @abstractmethod
     def carry_out(self, order: Order) -> str:
         """Do what a person asks for; return why not, or nothing. May block."""
-        return f"{order.order} is not possible here"
 
 
 SOURCE = "xrl view"

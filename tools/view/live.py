@@ -202,7 +202,7 @@ class LiveSource(Source):
             self._acting.end()
         session.close()
 
-    def frame(self, t_s: float) -> Frame | None:  # noqa: ARG002 - a live fleet has no other time
+    def frame(self) -> Frame | None:
         """Return the newest frame."""
         for topic, module, latest in self._latest:
             message = latest.take()

@@ -47,7 +47,7 @@ class LockstepSource(Source):
         self._ended.set()
         self._thread.join()
 
-    def frame(self, t_s: float) -> Frame | None:  # noqa: ARG002 - it has no other time
+    def frame(self) -> Frame | None:
         """Return the newest frame; None until it stands."""
         if self._failed:
             raise RunError(self._failed)

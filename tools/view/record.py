@@ -6,8 +6,6 @@ import base64
 import gzip
 import re
 from collections.abc import Callable
-from functools import cached_property
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -21,54 +19,35 @@ from tools.judge.reports.events import events_of
 from tools.judge.reports.run_data import RunData
 from tools.logs.run_log import NewestAt, RunLog
 from tools.view.frame import (
-    COURSE_FRAMES,
     FRAMES_S,
     PAGE,
     SHOWN,
     UPLOT,
     Frame,
     Mark,
-    Model,
     Newest,
-    Source,
+    model_of,
     without_fleet,
 )
 
 
-class RecordSource(Source):
-    """A run's record, or a part of it."""
-
-    kind = "record"
+class RecordFrames:
+    """Frames of a run's record, or of a part of it, at any time and in any order."""
 
     def __init__(self, log: RunLog, robot: RobotConfig) -> None:
-        super().__init__(robot)
-        self.title = str(log.path)
         self._data = RunData(log)
         self._newest = Newest(robot)
         self._keys = [(t, m, log.newest(t, m)) for t, m in SHOWN if t is not topics.RUN_EVENT]
         stalls = [row for row in log.messages(topics.RUN_EVENT) if row.kind == RunEventKind.STALLED]
         stalls.sort(key=lambda row: row.t_ns)  # each tells when it ended, and is told later
         self._keys.append((topics.RUN_EVENT, "", NewestAt(stalls)))
-        self._marks = tuple(
-            Mark(event.t, event.kind, event.text) for event in events_of(self._data)
-        )
-
-    def model(self) -> Model:
-        """Return what does not change, with the record's timeline and course."""
         span = self._data.span
-        return msgspec.structs.replace(
-            super().model(),
-            begin_s=span.begin, end_s=span.end, marks=self._marks, course=self._course,
+        self.model = msgspec.structs.replace(
+            model_of(robot, "record", log.path.name), begin_s=span.begin, end_s=span.end,
+            marks=tuple(Mark(event.t, event.kind, event.text) for event in events_of(self._data)),
         )  # fmt: skip
 
-    @cached_property
-    def _course(self) -> tuple[Frame, ...]:
-        begin_s, end_s = self._data.span
-        step_s = (end_s - begin_s) / COURSE_FRAMES
-        found = (self.frame(begin_s + n * step_s) for n in range(COURSE_FRAMES + 1))
-        return tuple(frame for frame in found if frame is not None)
-
-    def frame(self, t_s: float) -> Frame | None:
+    def at(self, t_s: float) -> Frame | None:
         """Return the frame at a time of the timeline; None before each module was heard."""
         t_ns = self._data.zero_ns + round(t_s * NS_PER_S)
         newest = self._newest
@@ -95,18 +74,16 @@ import(urls["./main.js"]);
 """
 
 
-def single_file(source: RecordSource, done: Callable[[float], None] = lambda _s: None) -> bytes:
+def single_file(record: RecordFrames, done: Callable[[float], None] = lambda _s: None) -> bytes:
     """Return the page with a whole record in it."""
-    model = source.model()
+    model = record.model
     count = round((model.end_s - model.begin_s) * FRAMES_S) + 1
     frames = []
     for number in range(count):
-        frames.append(source.frame(min(model.end_s, model.begin_s + number / FRAMES_S)))
+        frames.append(record.at(min(model.end_s, model.begin_s + number / FRAMES_S)))
         done(number / FRAMES_S)
     if not any(frames):
-        raise RunError(f"{source.title}: no moment at which all six modules were heard")
-    name = Path(model.title).name  # no path of this machine
-    model = msgspec.structs.replace(model, title=name, course=())  # the frames are beside it
+        raise RunError(f"{model.title}: no moment at which all six modules were heard")
     run = {"model": model, "frames": frames, "every_s": 1.0 / FRAMES_S}
     packed = base64.b64encode(gzip.compress(msgspec.json.encode(run), mtime=0)).decode()
     page = (PAGE / "index.html").read_text(encoding="utf-8")

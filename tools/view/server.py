@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,8 +19,6 @@ from aiohttp import WSMsgType, web
 from shared.exceptions import FleetError, XrlError
 from tools.view.frame import FRAMES_S, HOST, PAGE, PORT, UPLOT, Order, Source
 
-RATES: Final = (0.05, 20.0)
-"""Slowest and fastest rate at which a record is played."""
 MESSAGE_MAX: Final = 4096
 """Largest message of a page, bytes."""
 CLIENTS_MAX: Final = 8
@@ -44,55 +41,6 @@ _HEADERS: Final = {
     "Cache-Control": "no-store",
 }
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
-
-class Control(msgspec.Struct, frozen=True):
-    """What a page asks of its own cursor; a field that is left out stays as it is."""
-
-    play: bool | None = None
-    seek_s: float | None = None
-    rate: float | None = None
-
-
-class TimelineCursor:
-    """A place on a timeline that moves with a clock."""
-
-    def __init__(self, begin_s: float, end_s: float) -> None:
-        self._begin_s, self._end_s = begin_s, end_s
-        self._place_s = max(begin_s, min(0.0, end_s))
-        self._since_s: float | None = None
-        self._rate = 1.0
-
-    @property
-    def playing(self) -> bool:
-        """True while it moves."""
-        return self._since_s is not None
-
-    def at(self, now_s: float) -> float:
-        """Return the place; at the end it stops."""
-        if self._since_s is None:
-            return self._place_s
-        place = self._place_s + (now_s - self._since_s) * self._rate
-        if place >= self._end_s:
-            self._place_s, self._since_s = self._end_s, None
-            return self._end_s
-        return place
-
-    def control(
-        self, now_s: float, play: bool | None, seek_s: float | None, rate: float | None
-    ) -> None:
-        """Change what is not None; play at the end begins again, a rate stays within `RATES`."""
-        place, moving = self.at(now_s), self.playing
-        if seek_s is not None and math.isfinite(seek_s):
-            place = min(max(seek_s, self._begin_s), self._end_s)
-        if rate is not None and math.isfinite(rate):
-            self._rate = min(max(rate, RATES[0]), RATES[1])
-        if play is not None:
-            moving = play
-            if play and place >= self._end_s:
-                place = self._begin_s
-        self._place_s = place
-        self._since_s = now_s if moving and self._end_s > self._begin_s else None
 
 
 class ViewServer:
@@ -173,11 +121,9 @@ class ViewServer:
             async with self._lock:
                 await asyncio.to_thread(self._source.connect)
             await socket.send_str(self._model)
-            model = self._source.model()
-            cursor = TimelineCursor(model.begin_s, model.end_s)
-            sender = asyncio.create_task(self._send(socket, cursor))
+            sender = asyncio.create_task(self._send(socket))
             try:
-                await self._receive(socket, cursor)
+                await self._receive(socket)
             finally:
                 sender.cancel()
                 with contextlib.suppress(asyncio.CancelledError, ConnectionError):
@@ -193,27 +139,26 @@ class ViewServer:
                     await asyncio.to_thread(self._source.disconnect)
         return socket
 
-    async def _send(self, socket: web.WebSocketResponse, cursor: TimelineCursor) -> None:
+    async def _send(self, socket: web.WebSocketResponse) -> None:
         """Send a frame 30 times a second; while a page does not drain, the next are skipped."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         sent = b""
         while not socket.closed:
             try:
-                frame = self._source.frame(cursor.at(loop.time()))
+                frame = self._source.frame()
             except XrlError as error:
                 await socket.send_json({"error": str(error)})
                 return
-            text = msgspec.json.encode({"frame": frame, "playing": cursor.playing})
+            text = msgspec.json.encode({"frame": frame})
             if text != sent:
                 await socket.send_str(text.decode())
                 sent = text
             due = max(due + 1.0 / FRAMES_S, loop.time())
             await asyncio.sleep(due - loop.time())
 
-    async def _receive(self, socket: web.WebSocketResponse, cursor: TimelineCursor) -> None:
+    async def _receive(self, socket: web.WebSocketResponse) -> None:
         """Take what the page asks for, until it is gone."""
-        loop = asyncio.get_running_loop()
         waiting: asyncio.Queue[Order] = asyncio.Queue(ORDERS_MAX)
         worker = asyncio.create_task(self._work(socket, waiting))
         stops = set[asyncio.Task[None]]()
@@ -222,16 +167,11 @@ class ViewServer:
                 if message.type is not WSMsgType.TEXT:
                     continue
                 try:
-                    asked = msgspec.json.decode(message.data, type=dict)
-                    if "order" in asked:
-                        order = msgspec.convert(asked, Order)
-                        if order.order == "estop":
-                            stops.add(asyncio.create_task(self._stop(socket, order)))
-                        else:
-                            waiting.put_nowait(order)
+                    order = msgspec.json.decode(message.data, type=Order)
+                    if order.order == "estop":
+                        stops.add(asyncio.create_task(self._stop(socket, order)))
                     else:
-                        control = msgspec.convert(asked, Control)
-                        cursor.control(loop.time(), control.play, control.seek_s, control.rate)
+                        waiting.put_nowait(order)
                 except (msgspec.DecodeError, msgspec.ValidationError) as error:
                     await socket.send_json({"error": f"not understood: {error}"})
                 except asyncio.QueueFull:

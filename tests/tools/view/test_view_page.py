@@ -19,7 +19,7 @@ from tools.live.experiment import load_robot
 from tools.logs.run_log import read_run, robot_of
 from tools.view.frame import Source
 from tools.view.lockstep import LockstepSource
-from tools.view.record import RecordSource
+from tools.view.record import RecordFrames
 from tools.view.server import ViewServer
 
 pytestmark = [
@@ -54,9 +54,9 @@ def lockstep() -> Any:
 
 
 @pytest.fixture(scope="module")
-def recorded() -> RecordSource:
+def recorded() -> RecordFrames:
     log = read_run(LOG)
-    return RecordSource(log, robot_of(log))
+    return RecordFrames(log, robot_of(log))
 
 
 def button(order: str) -> str:
@@ -73,7 +73,7 @@ async def drag(
 
 
 def force_of(source: LockstepSource) -> tuple[float, float, float]:
-    frame = source.frame(0.0)
+    frame = source.frame()
     return frame.push if frame is not None else (0.0, 0.0, 0.0)
 
 
@@ -83,10 +83,10 @@ async def until(holds: Callable[[], bool]) -> None:
             await asyncio.sleep(0.01)
 
 
-async def scrub_and_play(page: Page, source: RecordSource, picture: Path) -> None:
+async def scrub_and_play(page: Page, source: RecordFrames, picture: Path) -> None:
     """Look at a record near its end, and play it from there."""
-    end_s = source.model().end_s
-    wanted = source.frame(end_s - 0.2)
+    end_s = source.model.end_s
+    wanted = source.at(end_s - 0.2)
     assert wanted is not None
     place = "document.getElementById('place')"
     await page.until(f"{place}?.max", lambda text: text not in (None, "", "100"))
@@ -94,24 +94,15 @@ async def scrub_and_play(page: Page, source: RecordSource, picture: Path) -> Non
     await page.until(HEIGHT, lambda at: at is not None and abs(at - wanted.torso[2]) < 0.002)
     await page.until(MODES, lambda text: text.count("TRACK") + text.count("HOLD") == 6)
     marks = await page.value("document.querySelectorAll('#marks i').length")
-    assert marks == len(source.model().marks)
+    assert marks == len(source.model.marks)
     await page.value("document.getElementById('play').click()")
     await page.until(f"Number({place}.value)", lambda at: abs(at - end_s) < 0.02)
     await page.until("document.getElementById('play').textContent", lambda text: text == "▶")
     await page.picture(picture)
 
 
-def test_a_record_is_scrubbed_stepped_and_played(recorded: RecordSource, tmp_path: Path) -> None:
-    async def work(page: Page, address: str) -> None:
-        await page.open(address)
-        await scrub_and_play(page, recorded, tmp_path / "record.png")
-        assert await page.value("document.getElementById('estop').hidden"), "nothing to stop"
-
-    with_page(recorded, work)
-
-
 def test_a_record_in_one_file_opens_without_a_server_and_is_scrubbed_and_played(
-    recorded: RecordSource, tmp_path: Path
+    recorded: RecordFrames, tmp_path: Path
 ) -> None:
     file = tmp_path / "run.html"
     assert cli.main(["view", str(LOG), "--html", str(file)]) == 0

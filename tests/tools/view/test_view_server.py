@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import math
 import socket
 import time
 from collections.abc import Awaitable, Callable
@@ -13,18 +12,14 @@ from typing import Any
 import aiohttp
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError
-from tools.view.frame import Frame, Model, Order, Source
+from tools.view.frame import FRAMES_S, Frame, Order, Source
 from tools.view.server import (
     CLIENTS_MAX,
     MESSAGE_MAX,
     ORDERS_MAX,
-    RATES,
-    TimelineCursor,
     ViewServer,
 )
 
@@ -46,18 +41,16 @@ def frame_at(t_s: float) -> Frame:
 
 
 class Recorded(Source):
-    """A source of ten seconds, that writes down what is asked of it."""
+    """A source that writes down what is asked of it."""
 
-    kind = "record"
+    kind = "lockstep"
     title = "test"
 
     def __init__(self, robot: RobotConfig) -> None:
         super().__init__(robot)
         self.connected: list[bool] = []
         self.orders_taken: list[Order] = []
-
-    def model(self) -> Model:
-        return msgspec.structs.replace(super().model(), begin_s=0.0, end_s=10.0)
+        self.looks = 0
 
     def connect(self) -> None:
         self.connected.append(True)
@@ -65,8 +58,9 @@ class Recorded(Source):
     def disconnect(self) -> None:
         self.connected.append(False)
 
-    def frame(self, t_s: float) -> Frame | None:
-        return frame_at(t_s)
+    def frame(self) -> Frame | None:
+        self.looks += 1
+        return frame_at(self.looks / FRAMES_S)
 
     def carry_out(self, order: Order) -> str:
         if order.service == "slow":
@@ -206,20 +200,12 @@ async def test_without_the_token_or_an_origin_there_is_nothing(bench: Bench) -> 
 
 
 @served
-async def test_a_source_listens_while_a_page_is_open_and_each_page_has_its_own_place(
-    bench: Bench,
-) -> None:
+async def test_a_source_listens_while_a_page_is_open(bench: Bench) -> None:
     assert bench.source.connected == []
     one, two = await bench.page(), await bench.page()
     assert (await message_with(one, "model"))["robot"] == "xrl"
-    await one.send_json({"seek_s": 7.5})
-    await message_with(one, "frame", lambda frame: frame["t_s"] == 7.5)
-    assert (await message_with(two, "frame"))["t_s"] == 0.0
-    await one.send_json({"seek_s": -99.0})
-    await message_with(one, "frame", lambda frame: frame["t_s"] == 0.0)
     await one.close()
-    await two.send_json({"play": True, "rate": 20.0})
-    await message_with(two, "frame", lambda frame: frame["t_s"] == 10.0)
+    await message_with(two, "frame")
     assert False not in bench.source.connected
     await two.close()
     await until(lambda: not bench.source.connected[-1])
@@ -227,7 +213,7 @@ async def test_a_source_listens_while_a_page_is_open_and_each_page_has_its_own_p
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "[]", "3", '{"seek_s": "far"}', '{"play": 7}', '{"order": 3}',
+    ["", "{", "[]", "3", "{}", '{"order": 3}',
      '{"order": "push", "force": [1, 2]}', '{"order": "push", "force": [1, 2, "x"]}',
      '{"order": "push", "force": null}'],
 )  # fmt: skip
@@ -238,10 +224,10 @@ async def test_what_is_not_understood_is_told_and_the_page_stays_open(
     page = await bench.page()
     await page.send_str(text)
     assert "not understood" in await message_with(page, "error")
-    await page.send_json({"seek_s": 1.0})
-    await message_with(page, "frame", lambda frame: frame["t_s"] == 1.0)
-    await page.close()
     assert bench.source.orders_taken == []
+    await page.send_json({"order": "push"})
+    await until(lambda: len(bench.source.orders_taken) == 1)
+    await page.close()
 
 
 @served
@@ -278,8 +264,7 @@ async def test_a_message_that_is_too_long_ends_the_page_and_no_other(bench: Benc
     async with asyncio.timeout(20.0):
         while (await one.receive()).type is not aiohttp.WSMsgType.CLOSE:
             pass
-    await two.send_json({"seek_s": 2.0})
-    await message_with(two, "frame", lambda frame: frame["t_s"] == 2.0)
+    await message_with(two, "frame")
     await two.close()
 
 
@@ -292,8 +277,9 @@ async def test_a_page_too_many_is_refused_and_one_that_does_not_drain_holds_up_n
     with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
         await bench.page()
     assert refused.value.status == 503
-    await pages[0].send_json({"play": True, "rate": 5.0})
-    await message_with(pages[0], "frame", lambda frame: frame["t_s"] == 10.0)
+    began = bench.source.looks
+    await until(lambda: bench.source.looks > began + 30)
+    await message_with(pages[0], "frame", lambda frame: frame["t_s"] > began / FRAMES_S)
     for page in pages:
         await page.close()
     writer.close()
@@ -314,8 +300,8 @@ def test_a_port_in_use_is_told(robot: RobotConfig) -> None:
 class Wordy(Recorded):
     """A source whose frames are longer than all buffers on their way."""
 
-    def frame(self, t_s: float) -> Frame | None:
-        return msgspec.structs.replace(frame_at(t_s), ways_out=("x" * 20_000_000,) * 6)
+    def frame(self) -> Frame | None:
+        return msgspec.structs.replace(frame_at(0.0), ways_out=("x" * 20_000_000,) * 6)
 
 
 def test_a_page_that_reads_nothing_does_not_hold_up_the_end(robot: RobotConfig) -> None:
@@ -331,36 +317,3 @@ def test_a_page_that_reads_nothing_does_not_hold_up_the_end(robot: RobotConfig) 
         writer.close()
 
     asyncio.run(main())
-
-
-NUMBERS = st.none() | st.floats(allow_nan=True, allow_infinity=True)
-CONTROLS = st.tuples(st.floats(0.0, 10.0), st.none() | st.booleans(), NUMBERS, NUMBERS)
-
-
-@given(st.lists(CONTROLS))
-def test_whatever_a_page_asks_for_it_stays_within_the_record(
-    asked: list[tuple[float, bool | None, float | None, float | None]],
-) -> None:
-    cursor, now_s = TimelineCursor(-3.0, 20.0), 0.0
-    for waits_s, play, seek_s, rate in asked:
-        now_s += waits_s
-        cursor.control(now_s, play, seek_s, rate)
-        place = cursor.at(now_s)
-        assert math.isfinite(place)
-        assert -3.0 <= place <= 20.0
-
-
-def test_a_cursor_plays_at_its_rate_stops_at_the_end_and_begins_anew() -> None:
-    cursor = TimelineCursor(-3.0, 20.0)
-    assert (cursor.at(5.0), cursor.playing) == (0.0, False), "it waits at the scenario's begin"
-    cursor.control(100.0, True, None, 2.0)
-    assert cursor.at(101.5) == 3.0
-    cursor.control(101.5, None, None, 0.5)
-    assert cursor.at(103.5) == 4.0, "a new rate makes no jump"
-    assert cursor.at(1000.0) == 20.0
-    assert not cursor.playing
-    cursor.control(1000.0, True, None, 1e9)
-    assert cursor.at(1000.5) == -3.0 + 0.5 * RATES[1]
-    nothing = TimelineCursor(0.0, 0.0)
-    nothing.control(0.0, True, None, None)
-    assert not nothing.playing

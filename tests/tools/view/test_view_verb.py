@@ -11,12 +11,11 @@ import urllib.request
 import pytest
 
 from shared.places import CHECKOUT
-from tests.tools.view.test_record_source import LOG
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_record_is_served_until_it_is_interrupted(number: signal.Signals) -> None:
-    command = [sys.executable, "-m", "tools.cli", "view", str(LOG), "--port", "0"]
+def test_a_page_is_served_until_it_is_interrupted(number: signal.Signals) -> None:
+    command = [sys.executable, "-m", "tools.cli", "view", "--sim", "--port", "0"]
     with subprocess.Popen(
         command, cwd=CHECKOUT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

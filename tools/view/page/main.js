@@ -84,7 +84,7 @@ function begin(given) {
     made.item.append(way);
     return { ...made, way };
   });
-  plots = new Plots($("plots"), model.course);
+  plots = new Plots($("plots"), model.course ?? []);
   if (model.source !== "record") $("stall").textContent = "preparing: no state yet";
   try {
     scene = new RobotScene($("scene"), model);
