@@ -220,7 +220,7 @@ def test_no_damage_ends_a_reader_without_words(
         ["info"],
         ["report", "--open", "no"],
         ["explain"],
-        ["resim", "--service", "knee_left", "--until-first-difference"],
+        ["resim", "--service", "knee_left"],
     ):
         expected = (0, 1, 2) if verb == "resim" else (0, 2)  # 1: another output than recorded
         assert cli.main(["log", verb, str(path), *words]) in expected

@@ -40,7 +40,7 @@ REQUIRED: Final = (
 VERBS: Final = (
     ("log info",), ("log info", "--full"), ("log info", "--json"), ("log explain",),
     ("log report", "--open", "no"),
-    ("log resim", "--service", "knee_left", "--until-first-difference"), ("log recover", "--force"),
+    ("log resim", "--service", "knee_left"), ("log recover", "--force"),
     ("log export", "--csv", "csv"), ("log export", "--ros2bag", "bag"),
     ("view", "--html", "view.html"),
     ("log play", "--rate", "100", "--duration", "0.1"),

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.shared.mcap_log.runs import writer_like
 from tools import cli
-from tools.logs.reexecution import rewritten
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import NOTHING, RunLog
 
@@ -87,9 +87,8 @@ def silent(run_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run's file with all that is said about it, and without a message."""
     log = RunLog(RunIndex(run_file), NOTHING)
     log.forget()
-    path = tmp_path_factory.mktemp("silent") / "run.mcap"
-    assert rewritten.write(log, path, {}, {}) == 0
-    return path
+    with writer_like(log, tmp_path_factory.mktemp("silent")) as run:
+        return run.path
 
 
 @pytest.mark.parametrize("words", [*WRITERS, *READERS])

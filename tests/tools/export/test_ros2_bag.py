@@ -15,8 +15,8 @@ from shared.bus import topics
 from shared.bus.messages import JointState, PlannerStatus
 from shared.joints import JOINTS, MODULES
 from tests.ros2_gateway.others import TYPES, read
+from tests.shared.mcap_log.runs import recorded_in_parts
 from tools import cli
-from tools.logs.reexecution import rewritten
 from tools.logs.run_log import read_run
 
 KNOWN = topics_of("")
@@ -99,8 +99,7 @@ def test_a_run_after_2038_is_refused_as_a_bag_and_has_its_other_exports(
     log = read_run(run_file)
     log.offset_ns += 540 * 365 * 86_400 * 10**9
     log.metadata["clock"]["offset_ns"] = str(log.offset_ns)
-    path = tmp_path / "late.mcap"
-    rewritten.write(log, path, {}, {})
+    path = recorded_in_parts(log, tmp_path / "late")
     bag = tmp_path / "bag"
     assert cli.main(["log", "export", str(path), "--ros2bag", str(bag)]) == 2
     assert "are beyond those of ROS 2, which end on 2038-01-19" in capsys.readouterr().err

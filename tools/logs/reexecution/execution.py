@@ -58,9 +58,9 @@ def ranges_of(
     part: RunPart,
     services: tuple[str, ...],
     tolerance: float,
+    workers: int,
     *,
     range_s: float = RANGE_S,
-    workers: int = 1,
 ) -> list[RangeTask]:
     """Return a part of a run in ranges, in their order."""
     pieces = divided(index, part, range_s, workers)

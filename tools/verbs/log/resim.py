@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Annotated, Final
 
 from rich import box
@@ -14,7 +12,6 @@ from rich.text import Text
 
 from services.planner.controller import controller_maker
 from shared import revision
-from shared.bus.messages import Message
 from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.joints import MODULES
 from shared.mcap_log import provenance
@@ -23,7 +20,6 @@ from tools.flags import FINITE_MAX, Arg, Count, Run
 from tools.judge.run_parts import PartFlags, part_of
 from tools.lab.studies.sweeps.pool import cores, results
 from tools.live.experiment import ControllerFlags
-from tools.logs.reexecution import rewritten
 from tools.logs.reexecution.compare import ReexecutionResult, likely_reason, size
 from tools.logs.reexecution.execution import (
     Execution,
@@ -35,7 +31,7 @@ from tools.logs.reexecution.execution import (
 )
 from tools.logs.reexecution.params import with_params
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunLog, has_own_controller, parts_of, read_part, robot_of
+from tools.logs.run_log import RunPart, has_own_controller, parts_of, robot_of
 from tools.terminal import Console, marked
 
 SERVICES: Final = ("planner", *MODULES)
@@ -45,7 +41,7 @@ SHOWN: Final = 12
 
 EXAMPLES: Final = """
 xrl log resim out/a/run.mcap                              # planner and six services
-xrl log resim out/a/run.mcap --service knee_left --until-first-difference
+xrl log resim out/a/run.mcap --service knee_left
 xrl log resim out/a/run.mcap --service planner --param law.K_p.x=2000
 xrl log resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
 xrl log resim out/a/run.mcap --tolerance 1e-9             # recorded on another machine class
@@ -68,15 +64,11 @@ class ResimFlags(ControllerFlags, PartFlags):
     ] = ()
     param: Annotated[tuple[str, ...], Arg(metavar="NAME=VALUE")] = ()
     """change a key of the robot file, such as law.K_p.x=2000 or joint_service.blend_ms=100, and
-    write what the same inputs give to a new file beside the old"""
-    until_first_difference: bool = False
-    """stop at the first difference"""
+    list what the same inputs change most"""
     tolerance: Annotated[float, Range(0.0, FINITE_MAX, ""), Arg(metavar="T")] = 0.0
     """largest accepted difference of numbers (default 0: equal to the last bit)"""
     workers: Annotated[Count, Arg(metavar="N")] = dataclasses.field(default_factory=cores)
     """processes for a run of over a minute (default: one for each core)"""
-    out: Path | None = None
-    """with --param: the new file (default: RUN.resim.mcap beside the old)"""
 
 
 def run(flags: ResimFlags) -> int:
@@ -86,35 +78,20 @@ def run(flags: ResimFlags) -> int:
     part = part_of(flags, index)
     chosen = set(flags.service or ("all",))
     names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)
-    path = flags.out or index.files[0].with_suffix(".resim.mcap")
-    if flags.param and path.exists():
-        raise RunError(f"{path}: already exists; remove it, or name another with --out")
-    recomputed = dict[str, list[Message]]()
-    # a new file, a controller's memory and a first difference need one part after the other
-    one_by_one = flags.param or flags.controller or flags.until_first_difference
-    whole: RunLog | None = None
+    # a controller's memory, and what a parameter has changed, go on from one part to the next
+    changed = bool(flags.param or flags.controller)
     with Progress(console=console, transient=True) as progress:
-        ranges = (
-            []
-            if one_by_one
-            else ranges_of(index, part, names, flags.tolerance, workers=flags.workers)
-        )
+        ranges = [] if changed else ranges_of(index, part, names, flags.tolerance, flags.workers)
         if len(ranges) > 1 and flags.workers > 1:
             outcomes = _side_by_side(ranges, flags.workers, progress)
         else:
-            # the new file is written from all of the old: that is read at once
-            whole = read_part(index, part, as_sent=True) if flags.param else None
-            logs = parts_of(index, part, as_sent=True) if whole is None else iter((whole,))
-            outcomes = _one_by_one(
-                flags, logs, min(part.end_s, index.length_s), names, recomputed, progress
-            )
+            outcomes = _one_by_one(flags, index, part, names, progress)
     if has_own_controller(index) and flags.controller is None and "planner" in names:
         console.print(
             "a custom controller led this run: the planner is equal only with --controller FILE",
             style="yellow",
         )
     console.print(summary(outcomes))
-    changed = bool(flags.param or flags.controller)
     for outcome in outcomes:
         tell(outcome, index, console, changed=changed)
     if not changed and any(outcome.differs for outcome in outcomes):
@@ -124,9 +101,7 @@ def run(flags: ResimFlags) -> int:
             f"{flags.log}: nothing could be executed: it has no checkpoint of these services; a "
             "run of over a second that this version recorded has"
         )
-    if whole is not None:
-        number = rewritten.write(whole, path, recomputed, {"params": ", ".join(flags.param)})
-        console.print(f"{number} messages, the recomputed ones among them, in {path}")
+    if flags.param:
         return 0
     return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else FAULT_EXIT_CODE
 
@@ -146,17 +121,12 @@ def _side_by_side(
 
 
 def _one_by_one(
-    flags: ResimFlags,
-    logs: Iterator[RunLog],
-    end_s: float,
-    names: tuple[str, ...],
-    recomputed: dict[str, list[Message]],
-    progress: Progress,
+    flags: ResimFlags, index: RunIndex, part: RunPart, names: tuple[str, ...], progress: Progress
 ) -> list[ReexecutionResult]:
     """Execute a run's services part by part, here."""
     executions: list[Execution] = []
-    task = progress.add_task("executing again", total=None)
-    for log in logs:
+    task = progress.add_task("executing again", total=min(part.end_s, index.length_s))
+    for log in parts_of(index, part, as_sent=True):
         if not executions:
             robot = with_params(robot_of(log), flags.param, str(flags.log))
             make = controller_maker(flags.controller, robot) if flags.controller else None
@@ -165,23 +135,11 @@ def _one_by_one(
                 execution_of(robot, name, flags.tolerance, exact=exact, controller=make)
                 for name in names
             ]
-        for number, execution in enumerate(executions):
-            if flags.until_first_difference and execution.outcome.differs:
-                continue
-            done_s = number / len(executions) * (log.end_ns - log.begin_ns) / 1e9
-            progress.update(
-                task,
-                description=f"executing {execution.outcome.service}",
-                completed=(log.begin_ns - log.began_ns()) / 1e9 + done_s,
-                total=end_s,
-            )
-            for key, message in execution.run(log):
-                if flags.param:
-                    recomputed.setdefault(key, []).append(message)
-                if flags.until_first_difference and execution.outcome.differs:
-                    break
-        if flags.until_first_difference and all(one.outcome.differs for one in executions):
-            break
+        for execution in executions:
+            progress.update(task, description=f"executing {execution.outcome.service}")
+            for _ in execution.run(log):
+                pass
+        progress.update(task, completed=(log.end_ns - log.began_ns()) / 1e9)
     return [execution.outcome for execution in executions]
 
 

@@ -10,9 +10,13 @@ import sys
 from pathlib import Path
 from typing import Final
 
+from mcap.well_known import MessageEncoding
+from mcap.writer import CompressionType, Writer
+
 from shared.bus import topics
 from shared.clock import NS_PER_S
-from tools.logs.reexecution import rewritten
+from shared.mcap_log import schema
+from shared.mcap_log.writer import PROFILE
 from tools.logs.run_log import RunLog, read_run
 
 KEPT_FROM_S: Final = 2.3
@@ -49,12 +53,27 @@ def shortened(log: RunLog) -> RunLog:
 def main() -> None:
     """Write it."""
     source, out = map(Path, sys.argv[1:])
-    rewritten.write(
-        shortened(read_run(source)),
-        out,
-        {},
-        {"made_by": "tests.tools.logs.reexecution.make_golden"},
-    )
+    log = shortened(read_run(source))
+    rows = [(t, key, data, seq) for key in log.keys() for t, data, seq in log.raw(key)]  # noqa: SIM118
+    types = topics.all_keys(log.robot)
+    with out.open("xb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile=PROFILE)
+        for name, entries in log.metadata.items():
+            writer.add_metadata(name, dict(entries))
+        for name, content in log.attachments.items():
+            writer.add_attachment(0, 0, name, "application/octet-stream", content)
+        channels: dict[str, int] = {}
+        for received_ns, key, data, seq in sorted(rows):
+            if key not in channels:
+                kind = types[key].type
+                number = writer.register_schema(
+                    schema.name_of(kind), schema.ENCODING, schema.encoded(kind)
+                )
+                channels[key] = writer.register_channel(key, MessageEncoding.JSON, number, {})
+            t_ns = received_ns + log.offset_ns
+            writer.add_message(channels[key], t_ns, data, t_ns, seq & 0xFFFFFFFF)
+        writer.finish()
 
 
 if __name__ == "__main__":

@@ -100,7 +100,7 @@ def test_ranges_side_by_side_execute_every_tick_once_as_one_after_the_other(
     names = ("planner", "knee_left")
 
     def tasks(range_s: float) -> list[RangeTask]:
-        return ranges_of(log.index, WHOLE, names, 0.0, range_s=range_s, workers=4)
+        return ranges_of(log.index, WHOLE, names, 0.0, 4, range_s=range_s)
 
     assert [len(tasks(range_s)) for range_s in (1.3, 3.0, 60.0)] == [8, 4, 1], "for each worker"
     found = merged([pickle.loads(pickle.dumps(execute_range(task))) for task in tasks(3.0)])  # noqa: S301
@@ -212,7 +212,7 @@ def test_a_difference_is_told_with_its_likely_reason_and_none_without(
 ) -> None:
     versions = provenance.packages()
     reason = f"numpy {versions['numpy']}, here 0.1"
-    words = ["log", "resim", str(recorded), "--service", "planner", "--until-first-difference"]
+    words = ["log", "resim", str(recorded), "--service", "planner"]
     words += ["--from", "-1.2", "--to", "0.3"]
     monkeypatch.setattr(provenance, "packages", lambda: versions | {"numpy": "0.1"})
     assert exit_code(words) == 0
@@ -256,28 +256,12 @@ def test_one_file_of_a_split_run_stands_for_itself(directory: Path) -> None:
     assert outcome.ticks > 0
 
 
-def test_a_changed_gain_changes_what_comes_out_in_a_new_file_that_is_no_part_of_the_run(
-    log: RunLog, directory: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_changed_gain_changes_what_comes_out_and_is_listed(
+    directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["log", "resim", str(directory), "--service", "planner", "--param", "gains.k_p_x=2000"]
-    path = directory / "run.resim.mcap"
-    try:
-        assert cli.main(words) == 0
-        text = capsys.readouterr().out
-        assert cli.main(words) == 2, "it is there already"
-        assert len(read_run(directory).files) == 3
-        new = read_run(path)
-    finally:
-        path.unlink(missing_ok=True)
+    assert cli.main(words) == 0
+    text = capsys.readouterr().out
     assert "planner, first at" in text
     assert "largest changes" in text
-    assert new.metadata["resim"]["params"] == "gains.k_p_x=2000"
-    assert new.count(topics.SIM_TRUTH.key(log.robot)) == log.count(topics.SIM_TRUTH.key(log.robot))
-    old_commands = log.messages(topics.JOINT_COMMAND, "ankle_left")
-    new_commands = new.messages(topics.JOINT_COMMAND, "ankle_left")
-    assert 0.9 * len(old_commands) < len(new_commands) <= len(old_commands)
-    changed = {(c.session, c.seq): c for c in new_commands}
-    same = [c for c in old_commands if changed.get((c.session, c.seq)) == c]
-    assert len(same) < 0.5 * len(old_commands)
-    assert cli.main([*words, "--to", "-1.5", "--out", str(tmp_path / "new.mcap")]) == 0
-    assert read_run(tmp_path / "new.mcap").metadata["resim"]["params"] == "gains.k_p_x=2000"
+    assert "joint/ankle_left/command" in text
