@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.exceptions import RunError
 from tests.shared.mcap_log.runs import STATE_KEY, item, write, write_in_parts, writer
 from tools.logs.run_index import RunIndex
-from tools.verbs.log.play import Entry, Played, PlayedPart, pace
+from tools.logs.run_log import RunPart
+from tools.verbs.log.play import Entry, Played, entries, pace
 
 LENGTH = 40
 """Messages, a millisecond apart."""
@@ -37,13 +37,13 @@ class World:
         return len(self.sent) <= self._sent_until
 
     def play(self, rate: float, count: int = LENGTH) -> Played:
-        entries = [Entry(10 * NS_PER_MS * n, "x", b"%d" % n) for n in range(count)]
+        rows = [Entry(10 * NS_PER_MS * n, "x", b"%d" % n) for n in range(count)]
         played = Played()
         pace(
-            entries, {"x": self}, rate, played, now_ns=lambda: self.now_ns, sleep=self.sleep,
+            rows, {"x": self}, rate, played, now_ns=lambda: self.now_ns, sleep=self.sleep,
             heard=lambda: len(self.sent) >= self._heard_from, show=self.shown.append,
         )  # fmt: skip
-        assert [payload for _, payload in self.sent] == [entry.payload for entry in entries]
+        assert [payload for _, payload in self.sent] == [entry.payload for entry in rows]
         return played
 
 
@@ -79,21 +79,17 @@ def test_the_summary_counts_what_nobody_received_and_what_was_not_sent() -> None
     assert "nobody listened" in World(heard_from=99).play(1.0).summary(1, 0.4)
 
 
-def test_a_part_is_counted_from_the_first_message_of_the_log(tmp_path: Path) -> None:
+def test_parts_that_follow_each_other_hold_every_message_once(tmp_path: Path) -> None:
     index = RunIndex(write(tmp_path, [item(n) for n in range(LENGTH)]))
-    found = list(PlayedPart(index, 0.01, 0.005).entries())
+    found = list(entries(index, RunPart(0.01, 0.015), {STATE_KEY}))
     assert [entry.payload for entry in found] == [item(n)[1] for n in range(10, 15)]
     assert [entry.after_ns for entry in found] == [n * NS_PER_MS for n in range(5)]
-    parts = [list(PlayedPart(index, 0.01 * n, 0.01).entries()) for n in range(4)]
-    assert sum(map(len, parts)) == LENGTH, "parts that follow each other hold every message once"
-    with pytest.raises(RunError, match="none of these topics"):
-        PlayedPart(index, names=("estop",))
+    parts = [RunPart(0.01 * n, 0.01 * (n + 1)) for n in range(4)]
+    assert sum(len(list(entries(index, part, {STATE_KEY}))) for part in parts) == LENGTH
 
 
 def test_a_split_run_is_played_as_one_in_the_recorded_order(tmp_path: Path) -> None:
     rows = [item(n) for n in range(LENGTH)]
     write_in_parts(writer(tmp_path), rows)
-    part = PlayedPart(RunIndex(tmp_path))
-    assert part.keys == {STATE_KEY}
-    assert [entry.payload for entry in part.entries()] == [row[1] for row in rows]
-    assert part.length_ns == (LENGTH - 1) * NS_PER_MS
+    found = entries(RunIndex(tmp_path), RunPart(), {STATE_KEY})
+    assert [entry.payload for entry in found] == [row[1] for row in rows]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Annotated, Final, NamedTuple, Protocol
 
 import msgspec
@@ -19,8 +19,10 @@ from shared.exceptions import RunError
 from shared.places import DEFAULT_CONFIG
 from shared.toml_file import Range
 from tools.cli import INTERRUPTED
-from tools.flags import FINITE_MAX, Arg, Run, RunDirFlags, Seconds, option
+from tools.flags import Arg, Run, RunDirFlags, Seconds, option
+from tools.judge.run_parts import PartFlags, part_of
 from tools.logs.run_index import RunIndex
+from tools.logs.run_log import RunPart
 from tools.terminal import Console
 from tools.topic_keys import keys_named
 
@@ -28,8 +30,6 @@ PREFIX: Final = "replay"
 LISTEN: Final = "unixsock-stream/{run}/play.zenoh"
 RATE_MIN: Final = 0.001
 RATE_MAX: Final = 1000.0
-PASS_MIN_NS: Final = 100 * NS_PER_MS
-"""Shortest pass of a loop: a log of one message is not played without a pause."""
 SHOW_NS: Final = 200 * NS_PER_MS
 DROPPED_NS: Final = round(4.9 * NS_PER_S)
 """A `put` that takes 5 s has dropped the link of a subscriber that takes nothing."""
@@ -40,8 +40,8 @@ _FLUSH_S: Final = 1.0
 
 EXAMPLES: Final = """
 xrl log play out/a/run.mcap
-xrl log play out/a --rate 0.5 --loop
-xrl log play out/a --start-offset 10 --duration 2.5 --topic 'joint/*/state'
+xrl log play out/a --rate 0.5
+xrl log play out/a --from 10 --to 12.5 --topic 'joint/*/state'
 """
 
 ABOUT: Final = f"""
@@ -60,7 +60,7 @@ reports how many messages had no subscriber.
 """
 
 
-class PlayFlags(RunDirFlags):
+class PlayFlags(RunDirFlags, PartFlags):
     """Which part of a log is played, and how fast."""
 
     file: Run
@@ -68,14 +68,6 @@ class PlayFlags(RunDirFlags):
     """play only this: a name below xrl/<robot>/, or such as joint/*/state; may be repeated"""
     rate: Annotated[float, Range(RATE_MIN, RATE_MAX, ""), option("--rate", "-r", metavar="R")] = 1.0
     """recorded seconds per second"""
-    start_offset: Annotated[Seconds, option("--start-offset", "-s")] = 0.0
-    """start S seconds after the first message of the log"""
-    duration: Annotated[float | None, Range(1e-9, FINITE_MAX, "s"), option("--duration", "-d")] = (
-        None
-    )
-    """length of the part to play, in recorded seconds"""
-    loop: Annotated[bool, option("--loop", "-l")] = False
-    """repeat until Ctrl-C"""
     wait: Seconds = 1.0
     """longest wait for the first subscriber"""
     listen: Annotated[str, Arg(metavar="ENDPOINT", help=f"where to listen (default {LISTEN})")] = (
@@ -92,46 +84,17 @@ class Entry(NamedTuple):
     payload: bytes
 
 
-class PlayedPart:
-    """The part of a run that is played."""
-
-    def __init__(
-        self,
-        index: RunIndex,
-        start_offset_s: float = 0.0,
-        duration_s: float | None = None,
-        names: tuple[str, ...] = (),
-    ) -> None:
-        """Refuse a part without a message."""
-        self._index = index
-        self.begin_ns = index.began_ns + round(start_offset_s * NS_PER_S)
-        """Log time of its start, which belongs to it; `end_ns` does not."""
-        self.end_ns = index.ended_ns + 1
-        if duration_s is not None:
-            self.end_ns = min(self.end_ns, self.begin_ns + math.ceil(duration_s * NS_PER_S))
-        if self.begin_ns > index.ended_ns:
-            raise RunError(
-                f"--start-offset {start_offset_s:g}: the log is {index.length_s:.2f} s long"
-            )
-        chosen = {key.topic.key(index.robot, key.module) for key in keys_named(names)}
-        self.keys = chosen & index.keys_with_messages()
-        if next(self.entries(), None) is None:
-            raise RunError("none of these topics has a message in this part of the log")
-
-    @property
-    def length_ns(self) -> int:
-        """Time from its start to its last message."""
-        return self.end_ns - 1 - self.begin_ns
-
-    def entries(self) -> Iterator[Entry]:
-        """Yield its messages in the order of the files, one chunk in memory at a time."""
-        begin_ns, end_ns = self.begin_ns, self.end_ns
-        for record, keys in self._index.records(begin_ns, end_ns, frozenset(self.keys)):
-            body = record.body
-            for channel, _, log_ns, _, start, end in record.rows:
-                key = keys.get(channel, "")
-                if key in self.keys and begin_ns <= log_ns < end_ns:
-                    yield Entry(log_ns - begin_ns, key, body[start:end])
+def entries(index: RunIndex, part: RunPart, keys: Collection[str]) -> Iterator[Entry]:
+    """Yield a part's messages of some keys in the order of the files, one chunk in memory."""
+    begin_ns = index.began_ns + round(part.begin_s * NS_PER_S)
+    end_ns = index.ended_ns + 1
+    if part.end_s < index.length_s:
+        end_ns = index.began_ns + math.ceil(part.end_s * NS_PER_S)
+    for record, known in index.records(begin_ns, end_ns, frozenset(keys)):
+        for channel, _, log_ns, _, start, end in record.rows:
+            key = known.get(channel, "")
+            if key in keys and begin_ns <= log_ns < end_ns:
+                yield Entry(log_ns - begin_ns, key, record.body[start:end])
 
 
 class Port(Protocol):
@@ -150,19 +113,18 @@ class Played(msgspec.Struct):
     unheard: int = 0
     """Sent before anybody had subscribed."""
     dropped: int = 0
-    """Times that a subscriber took nothing for so long that its link was dropped."""
+    """Links that were dropped because a subscriber took nothing for 5 s."""
     late_max_ns: int = 0
     """Longest time after its moment that a message went out."""
-    late_sum_ns: int = 0
 
     def summary(self, keys: int, took_s: float) -> str:
         """Return how it went, in one line."""
-        mean_ms = self.late_sum_ns / max(1, self.sent + self.failed) / NS_PER_MS
+        late_ms = self.late_max_ns / NS_PER_MS
+        sent = f"{self.failed} not sent: the session is closed" if self.failed else "all sent"
         line = (
-            f"{self.sent} messages on {keys} keys in {took_s:.2f} s; late by {mean_ms:.2f} ms on "
-            f"average, {self.late_max_ns / NS_PER_MS:.1f} ms at most"
+            f"{self.sent} messages on {keys} keys in {took_s:.2f} s, up to {late_ms:.1f} ms late; "
+            f"{sent}"
         )
-        line += f"; {self.failed} not sent: the session is closed" if self.failed else "; all sent"
         if self.dropped:
             line += "; NOT ALL ARRIVED: a subscriber took nothing for 5 s and its link was dropped"
         if self.unheard == self.sent:
@@ -186,7 +148,7 @@ def pace(
     """Send each message when its time has come, and late ones at once, in order.
 
     Args:
-        entries: messages of one pass.
+        entries: the messages.
         ports: the way to each of their keys.
         rate: recorded seconds per second.
         played: counts, which grow.
@@ -204,9 +166,7 @@ def pace(
                 show(math.floor((time_ns - began_ns) * rate))
                 show_ns = time_ns + SHOW_NS
             sleep(max(0, min(due_ns, show_ns) - time_ns) / NS_PER_S)
-        late_ns = time_ns - due_ns
-        played.late_sum_ns += late_ns
-        played.late_max_ns = max(played.late_max_ns, late_ns)
+        played.late_max_ns = max(played.late_max_ns, time_ns - due_ns)
         is_heard = is_heard or heard()
         if not ports[key].put(payload):
             played.failed += 1
@@ -220,7 +180,11 @@ def run(flags: PlayFlags) -> int:
     """Play until the end or Ctrl-C."""
     console = Console()
     index = RunIndex(flags.file)
-    part = PlayedPart(index, flags.start_offset, flags.duration, flags.topic)
+    part = part_of(flags, index)
+    chosen = {key.topic.key(index.robot, key.module) for key in keys_named(flags.topic)}
+    keys = chosen & index.keys_with_messages()
+    if next(entries(index, part, keys), None) is None:
+        raise RunError("none of these topics has a message in this part of the log")
     if not index.complete or index.damage:
         words = f"{flags.file}: plays as far as it can be read; see `xrl log info`"
         console.print(words, style="yellow", markup=False, soft_wrap=True)
@@ -231,35 +195,35 @@ def run(flags: PlayFlags) -> int:
         session = stack.enter_context(
             open_session(robot, "play", flags.run_dir, listen=[flags.listen], only=())
         )
-        ports = {key: session.raw_publisher(f"{PREFIX}/{key}", patient=True) for key in part.keys}
+        ports = {key: session.raw_publisher(f"{PREFIX}/{key}", patient=True) for key in keys}
+        length_s = min(part.end_s, index.length_s) - part.begin_s
         words = (
-            f"{part.length_ns / NS_PER_S:.2f} s of {index.robot}, {len(ports)} keys, onto "
-            f"{PREFIX}/**; subscribers dial {expand(flags.listen, flags.run_dir)}"
+            f"{length_s:.2f} s of {index.robot}, {len(ports)} keys, onto {PREFIX}/**; "
+            f"subscribers dial {expand(flags.listen, flags.run_dir)}"
         )
         console.print(words, markup=False, soft_wrap=True)
         _await_subscriber(ports, flags.wait)
-        return _play(flags, part, ports, console)
+        return _play(flags.rate, entries(index, part, keys), ports, length_s, console)
 
 
 def _play(
-    flags: PlayFlags, part: PlayedPart, ports: Mapping[str, RawPublisher], console: Console
+    rate: float,
+    messages: Iterator[Entry],
+    ports: Mapping[str, RawPublisher],
+    length_s: float,
+    console: Console,
 ) -> int:
     """Play, and say at the end how it went."""
     columns = (TextColumn("{task.completed:.2f} / {task.total:.2f} s"),)
     played, began_ns = Played(), now_ns()
     try:
         with Progress(*columns, console=console, transient=True) as progress:
-            task = progress.add_task("", total=part.length_ns / NS_PER_S)
-            while True:
-                pass_ends_ns = now_ns() + math.ceil(max(part.length_ns, PASS_MIN_NS) / flags.rate)
-                pace(
-                    part.entries(), ports, flags.rate, played, now_ns=now_ns, sleep=time.sleep,
-                    heard=lambda: any(port.matched for port in ports.values()),
-                    show=lambda at_ns: progress.update(task, completed=at_ns / NS_PER_S),
-                )  # fmt: skip
-                if not flags.loop:
-                    break
-                time.sleep(max(0, pass_ends_ns - now_ns()) / NS_PER_S)
+            task = progress.add_task("", total=length_s)
+            pace(
+                messages, ports, rate, played, now_ns=now_ns, sleep=time.sleep,
+                heard=lambda: any(port.matched for port in ports.values()),
+                show=lambda at_ns: progress.update(task, completed=at_ns / NS_PER_S),
+            )  # fmt: skip
     except KeyboardInterrupt:
         return INTERRUPTED
     finally:
