@@ -23,14 +23,12 @@ from types import FrameType
 from typing import Final
 
 from services.recorder.auto_recover import AutoRecovery
-from services.recorder.host_watch import MIB, HostWatch, Roster, free_bytes_at
+from services.recorder.host_watch import MIB, Roster, RunDirWatch, free_bytes_at
 from services.recorder.loop import CAPACITY, Recorder, summary
 from services.recorder.snapshot import SnapshotRing
 from shared import log, revision, scheduling
 from shared.bus import topics
-from shared.bus.security import ports_here
 from shared.bus.session import open_session
-from shared.bus.sockets import Arrivals
 from shared.clock import keep_pace, now_ns, pace
 from shared.config import gain_schedule
 from shared.config.files import load
@@ -103,7 +101,7 @@ def main() -> int:
                 logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
                 auto_recovery.start()
                 roster = None if arguments.of else Roster(session)
-                host = HostWatch(Arrivals(ports_here(config)), arguments.run_dir, logger, now_ns())
+                host = RunDirWatch(arguments.run_dir, logger, now_ns())
                 _record(recording, stop, asked, roster, host)
         except RunError as error:
             logger.error("%s", error)
@@ -143,7 +141,7 @@ def _record(
     stop: StopFlag,
     asked: SnapshotRequest,
     roster: Roster | None,
-    host: HostWatch,
+    host: RunDirWatch,
 ) -> None:
     """Record until `stop`, then the queued rest."""
     while not stop:

@@ -1,6 +1,6 @@
-"""What goes wrong on the recorder's host: a full disk, floods of the bus's ports; who is linked.
+"""What goes wrong on the recorder's host: a full disk; and who is linked.
 
-No other service has the time to look for them. When the disk is too full to go on recording,
+No other service has the time to look for it. When the disk is too full to go on recording,
 nothing is ever deleted: below the least free space the file is finished while there is still room
 for its end, and recording waits. Once there is clearly more again it goes on with the run's next
 file. A run that is stopped here does not end the recorder.
@@ -17,7 +17,6 @@ from typing import Final
 from shared.bus import topics
 from shared.bus.messages import ToolRoster
 from shared.bus.session import Session
-from shared.bus.sockets import Arrivals
 from shared.clock import NS_PER_MS, NS_PER_S
 
 MIB: Final = 1 << 20
@@ -31,8 +30,6 @@ CALM: Final = 2.5
 RUN_DIR_MIN_MIB: Final = 16
 """Free space below which the run directory is called full: its logs lose lines soon."""
 _EVERY_NS: Final = 2 * NS_PER_S
-_AGAIN_NS: Final = 10 * NS_PER_S
-"""A flood that lasts is said so often."""
 
 
 class DiskChange(Enum):
@@ -96,30 +93,20 @@ class Deadline:
         return True
 
 
-class HostWatch:
-    """Checks every two seconds."""
+class RunDirWatch:
+    """Checks the disk of the run directory every two seconds."""
 
-    def __init__(
-        self, arrivals: Arrivals, run_dir: Path, logger: logging.Logger, now_ns: int
-    ) -> None:
-        self._arrivals, self._run_dir, self._logger = arrivals, run_dir, logger
+    def __init__(self, run_dir: Path, logger: logging.Logger, now_ns: int) -> None:
+        self._run_dir, self._logger = run_dir, logger
         self._guard = SpaceGuard(RUN_DIR_MIN_MIB)
         self._due = Deadline(_EVERY_NS, now_ns)
-        self._say_at_ns = now_ns
         self.trouble = ""
         """What is wrong with the run directory's disk, in words; empty if nothing is."""
 
     def check_if_due(self, now_ns: int) -> None:
-        """Check what is due, and warn of what is found."""
+        """Check if it is due, and warn of what is found."""
         if not self._due.passed(now_ns):
             return
-        flood = self._arrivals.flood(now_ns)
-        if flood and now_ns >= self._say_at_ns:
-            self._say_at_ns = now_ns + _AGAIN_NS
-            self._logger.warning("%s", flood)
-        self._check_disk()
-
-    def _check_disk(self) -> None:
         try:
             free = free_bytes_at(self._run_dir)
         except OSError as error:

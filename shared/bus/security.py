@@ -229,13 +229,6 @@ def listening(robot: RobotConfig, service: str, here: frozenset[str]) -> tuple[s
     return (own, public) if own != public and (others or robot.bus.security.allow) else (own,)
 
 
-def ports_here(robot: RobotConfig) -> frozenset[int]:
-    """Return the ports at which this host's services listen under `mtls`."""
-    here = services_here(robot)
-    endpoints = [endpoint for service in here for endpoint in listening(robot, service, here)]
-    return frozenset(host_and_port(each)[1] for each in endpoints if each.startswith(TCP))
-
-
 def _is_own(endpoint: str) -> bool:
     """Return True if an endpoint's host is this one. Nothing is sent."""
     return any(map(_is_own_address, sockets.addresses_of(host_and_port(endpoint)[0])))

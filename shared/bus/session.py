@@ -20,7 +20,7 @@ import re
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Generic, Self, TypeAlias, TypeVar
 
@@ -29,11 +29,9 @@ import zenoh
 from shared import log
 from shared.bus import security, sockets, tls_probe
 from shared.bus.codec import Decoder, encode
-from shared.bus.credentials import Credentials, read_credentials
+from shared.bus.credentials import read_credentials
 from shared.bus.messages import Message
 from shared.bus.security import alive_prefix, token_key, tools_prefix
-from shared.bus.sockets import Address
-from shared.bus.tls_probe import LinkWatch
 from shared.bus.topics import Priority, Topic
 from shared.clock import keep_pace, now_ns
 from shared.config.endpoints import host_and_port, is_endpoint
@@ -231,8 +229,6 @@ class Session:
         self._session = session
         self._alive_prefix = f"{alive_prefix(robot)}/"
         self._token = session.liveliness().declare_token(token_key(robot, name, place_of_tool()))
-        self._link_watch: LinkWatch | None = None
-        self._linked: set[Address] = set()
         if over_tcp:  # held, or it would end
             self._links = session.info.declare_link_events_listener(self._meet, history=True)
 
@@ -249,8 +245,6 @@ class Session:
 
         Takes up to one lease if a peer is stopped; never raises.
         """
-        if self._link_watch is not None:
-            self._link_watch.end()
         with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
@@ -323,27 +317,16 @@ class Session:
             )
         )
 
-    def watch_links(self, own: Credentials, dialled: Mapping[str, str]) -> None:
-        """Log from now on why TLS links to these peers do not come (`shared.bus.tls_probe`)."""
-        if dialled:
-            self._link_watch = LinkWatch(own, dialled, self.is_linked)
+    @staticmethod
+    def _meet(event: zenoh.LinkEvent) -> None:
+        """Have a TCP link closed by a reset.
 
-    def is_linked(self, endpoint: str) -> bool:
-        """Return True if there is a link with tls/HOST:PORT."""
-        host, port = host_and_port(endpoint)
-        return any((str(address), port) in self._linked for address in sockets.addresses_of(host))
-
-    def _meet(self, event: zenoh.LinkEvent) -> None:
-        if not event.link.src.startswith(security.TCP):
-            return
-        there = host_and_port(event.link.dst)
-        if event.kind == zenoh.SampleKind.PUT:
-            self._linked.add(there)
-            # Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut
-            # for longer than the lease, all links stalled for up to 10 s for each lost link.
-            sockets.reset_on_close(host_and_port(event.link.src), there)
-        else:
-            self._linked.discard(there)
+        Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut for
+        longer than the lease, all links stalled for up to 10 s for each lost link.
+        """
+        here, there = event.link.src, event.link.dst
+        if event.kind == zenoh.SampleKind.PUT and here.startswith(security.TCP):
+            sockets.reset_on_close(host_and_port(here), host_and_port(there))
 
     def _key(self, topic: Topic, message_type: type[Message], module: str) -> str:
         if message_type is not topic.type:
@@ -428,21 +411,10 @@ def open_session(
         raise _open_error(name, listening, error) from None
     security.limit_queues(config, listening)
     if config.bus.security.mode == "mtls":
-        _look_after_links(session, config, name, dict(zip(peers, dialling, strict=False)))
+        credentials = read_credentials(config, name)
+        if fault := tls_probe.own_fault(credentials):
+            log.get("xrl").error("no link over TLS: %s %s", credentials.certificate, fault)
     return session
-
-
-def _look_after_links(
-    session: Session, config: RobotConfig, name: str, dialled: Mapping[str, str]
-) -> None:
-    """Log what keeps links from coming: a certificate that this host's clock does not believe."""
-    own = read_credentials(config, name)
-    fault = tls_probe.own_fault(own)
-    if fault:
-        log.get("xrl").error("no link over TLS: %s %s", own.certificate, fault)
-    if name in SERVICES:
-        over_tls = {peer: at for peer, at in dialled.items() if at.startswith(security.TCP)}
-        session.watch_links(own, over_tls)
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:

@@ -4,9 +4,6 @@ A TLS listener of Zenoh sleeps for 100 ms after each failed handshake. It also a
 connections that wait meanwhile, each with a descriptor: 640 bad connections a second left 4700
 open in a minute. With a queue of one it accepts no more than it ends. Which addresses reach the
 ports at all is for the firewall (`deploy/nftables`).
-
-Zenoh does not report a handshake that fails. A flood shows in the connections that the kernel turns
-away because a listener's queue is full, and in who begins others (`Arrivals`).
 """
 
 from __future__ import annotations
@@ -16,12 +13,9 @@ import ipaddress
 import re
 import socket
 import struct
-from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
-
-from shared.clock import NS_PER_S
+from typing import Final, TypeAlias
 
 IpAddress: TypeAlias = "ipaddress.IPv4Address | ipaddress.IPv6Address"
 Address = tuple[str, int]
@@ -93,63 +87,12 @@ def _waiting_max() -> int:
 
 # ---- connections of this host, as /proc/net has them
 
-FLOOD_HZ: Final = 20.0
-"""Connections turned away per second from which it is a flood; a fleet that starts has a few."""
-
 _PROC_NET: Final = Path("/proc/net")
 _TCP: Final = ("tcp", "tcp6")
-_ROW: Final = re.compile(
-    rb"^ *\d+: [0-9A-F]+:([0-9A-F]{4}) ([0-9A-F]+):([0-9A-F]{4}) (?!0A)", re.MULTILINE
-)
-"""Own port, other address and port; 0A listens, and has none."""
 _ESTABLISHED: Final = re.compile(
     rb"^ *\d+: \S+ ([0-9A-F]+):([0-9A-F]{4}) 01 (?:\S+ +){5}(\d+)", re.MULTILINE
 )
 """Other address and port, and the socket's number."""
-
-
-class _Sample(NamedTuple):
-    t_ns: int
-    turned_away: int
-    connections: frozenset[tuple[bytes, bytes, bytes]]
-    """Own port, other address and its port, as /proc has them."""
-
-
-class Arrivals:
-    """Connections to some ports of this host, between two looks."""
-
-    def __init__(self, ports: Collection[int], proc_net: Path = _PROC_NET) -> None:
-        self._ports = {b"%04X" % port for port in ports}
-        self._proc_net = proc_net
-        self._last: _Sample | None = None
-
-    def flood(self, now_ns: int) -> str:
-        """Return who floods the ports since the last call, in words; empty if nobody does."""
-        if not self._ports:
-            return ""
-        last, now = self._last, self._sample(now_ns)
-        self._last = now
-        if last is None or now.t_ns <= last.t_ns:
-            return ""
-        turned_away = (now.turned_away - last.turned_away) * NS_PER_S / (now.t_ns - last.t_ns)
-        if turned_away < FLOOD_HZ:
-            return ""
-        begun = Counter(address for _, address, _ in now.connections - last.connections)
-        whom = ", ".join(f"{_address(text)} ({count})" for text, count in begun.most_common(3))
-        who = f"connections begun by {whom}" if whom else "nobody seen at the bus's ports"
-        return f"flood: {turned_away:.0f} connections/s to this host turned away; {who}"
-
-    def _sample(self, now_ns: int) -> _Sample:
-        rows = _ROW.findall(_tables(self._proc_net, *_TCP))
-        ours = frozenset(row for row in rows if row[0] in self._ports)
-        return _Sample(now_ns, self._turned_away(), ours)
-
-    def _turned_away(self) -> int:
-        rows = [line.split() for line in _tables(self._proc_net, "netstat").splitlines()]
-        for names, values in zip(rows[::2], rows[1::2], strict=False):
-            if names[0] == b"TcpExt:" and b"ListenDrops" in names:
-                return int(values[names.index(b"ListenDrops")])
-        return 0
 
 
 def established(inodes: Collection[int], proc_net: Path = _PROC_NET) -> set[Address]:

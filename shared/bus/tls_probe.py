@@ -4,21 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
-import os
 import socket
 import ssl
-import threading
-from collections.abc import Callable, Mapping
 from typing import Final
 
-from shared import log
 from shared.bus.credentials import Credentials
 from shared.config.endpoints import host_and_port
 
 _CONNECT_S: Final = 1.0
 _ALERT_S: Final = 0.3
 """A listener that does not believe our certificate says so after the handshake (RFC 8446)."""
-_EVERY_S: Final = 5.0
 
 _ALERTS: Final = {
     "CERTIFICATE_EXPIRED": "by its clock our certificate has expired, or is not valid yet",
@@ -86,41 +81,6 @@ def refusal(own: Credentials, endpoint: str) -> str:
         return "" if str(error) == "The read operation timed out" else "no answer"
     except OSError as error:
         return error.strerror or str(error)
-
-
-class LinkWatch:
-    """Logs why the TLS links that a process dials do not come, in a thread of its own.
-
-    `dialled` has the endpoint of each peer, `is_linked` takes one. Only for processes that dial: a
-    joint service dials nobody, and has one thread.
-    """
-
-    def __init__(
-        self,
-        own: Credentials,
-        dialled: Mapping[str, str],
-        is_linked: Callable[[str], bool],
-        every_s: float = _EVERY_S,
-    ) -> None:
-        self._own, self._dialled, self._is_linked = own, dialled, is_linked
-        self._every_s = every_s
-        self._reported: dict[str, str] = {}
-        self._ended = threading.Event()
-        threading.Thread(target=self._run, daemon=True, name="link-watch").start()
-
-    def end(self) -> None:
-        """Stop the watch; a probe that runs ends by itself."""
-        self._ended.set()
-
-    def _run(self) -> None:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))  # of this thread alone
-        while not self._ended.wait(self._every_s):
-            for peer, endpoint in self._dialled.items():
-                why = "" if self._is_linked(endpoint) else refusal(self._own, endpoint)
-                if why != self._reported.get(peer, "") and not self._ended.is_set():
-                    self._reported[peer] = why
-                    report = f"no link with {peer} at {endpoint}: {why}"
-                    log.get("xrl").warning("%s", report if why else f"link with {peer} is there")
 
 
 def _client(own: Credentials) -> ssl.SSLContext:

@@ -14,10 +14,9 @@ from services.recorder.host_watch import (
     MIB,
     RUN_DIR_MIN_MIB,
     DiskChange,
-    HostWatch,
+    RunDirWatch,
     SpaceGuard,
 )
-from shared.bus.sockets import Arrivals
 from shared.clock import NS_PER_S
 
 
@@ -33,7 +32,7 @@ def test_a_run_directory_whose_disk_fills_is_told_until_there_is_space(
         return free[0] * MIB
 
     monkeypatch.setattr(host_watch, "free_bytes_at", free_at)
-    watch = HostWatch(Arrivals(()), tmp_path, logging.getLogger("xrl"), 0)
+    watch = RunDirWatch(tmp_path, logging.getLogger("xrl"), 0)
     now_ns = 0
 
     def look(free_mib: int) -> str:

@@ -1,4 +1,4 @@
-"""Sockets by the kernel: short queues, links given up at once, floods told."""
+"""Sockets by the kernel: short queues, links given up at once, who is linked."""
 
 from __future__ import annotations
 
@@ -9,16 +9,12 @@ import struct
 from contextlib import ExitStack
 from pathlib import Path
 
-import pytest
-
 from shared.bus import sockets
 from shared.bus.session import open_session
 from shared.bus.sockets import (
-    Arrivals,
     addresses_of,
     established,
 )
-from shared.clock import NS_PER_S
 from shared.config.robot_config import RobotConfig
 from tests.certified import opened, tls_endpoints
 from tests.waiting import comes_true

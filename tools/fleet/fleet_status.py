@@ -34,7 +34,7 @@ from shared.bus.messages import (
 )
 from shared.bus.security import TCP
 from shared.bus.session import Latest, Session, peers_of, place_of_tool
-from shared.bus.sockets import Arrivals, addresses_of
+from shared.bus.sockets import addresses_of
 from shared.bus.tls_probe import own_fault, refusal
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
@@ -157,7 +157,7 @@ class FleetStatus(msgspec.Struct, frozen=True):
     trouble: tuple[str, ...] = ()
     """What is wrong with supervision, logs and disk, a line each."""
     bus_faults: tuple[str, ...] = ()
-    """Under `mtls`: links that TLS refuses, and who floods this host's ports, in words."""
+    """Under `mtls`: links that TLS refuses, in words."""
 
 
 class RateMonitor:
@@ -228,18 +228,11 @@ class BusFaults:
         self._robot, self._session = robot, session
         self.mode = robot.bus.security.mode
         self._here = security.services_here(robot)
-        self._arrivals = Arrivals(security.ports_here(robot))
-        self.begin()
-
-    def begin(self) -> None:
-        """Count from here on."""
-        self._arrivals.flood(now_ns())
 
     def describe(self, pids: dict[str, int]) -> tuple[str, ...]:
         """Return what is wrong, in words; takes up to 2 s if a link does not come."""
         if self.mode != "mtls":
             return ()
-        flood = self._arrivals.flood(now_ns())
         links = list(self._missing(pids))
         with ThreadPoolExecutor(_PROBES_AT_ONCE) as pool:
             found = pool.map(lambda link: refusal(link[1], link[3]), links)
@@ -248,7 +241,7 @@ class BusFaults:
                 for (dials, _, peer, endpoint), why in zip(links, found, strict=True)
                 if why
             ]
-        return (*([flood] if flood else []), *self._own_faults(), *refused)
+        return (*self._own_faults(), *refused)
 
     def _own_faults(self) -> Iterator[str]:
         found: dict[str, list[str]] = {}
@@ -308,7 +301,6 @@ def read_status(
     fleet: SupervisedFleet, monitors: Mapping[str, RateMonitor], bus: BusFaults
 ) -> FleetStatus:
     """Listen for one window and return the fleet's status."""
-    bus.begin()
     for monitor in monitors.values():
         monitor.new_window()
     _listen(monitors, _WINDOW_S)
