@@ -7,7 +7,6 @@ at most one in four, and `STUFFING` as measured on this robot's frames.
 
 from __future__ import annotations
 
-import math
 from typing import Final, NamedTuple
 
 from shared.config.robot_config import RobotConfig
@@ -34,42 +33,16 @@ LOADCELL_FRAMES: Final = 3
 
 
 class BusLoad(NamedTuple):
-    """Traffic of the devices on a bus, bit/s."""
+    """Load of a bus, as shares of it."""
 
-    cyclic: float
-    """By each axis for each Hz of the control rate: estimate and target, bit."""
     steady: float
-    """By each axis: heartbeat and gains, bit/s."""
-    blend: float
-    """By each axis while gains blend, on top, bit/s."""
-    other: float
-    """By the harness sensor, bit/s."""
-    axes: int
+    blending: float
+    """While gains blend."""
 
-    def share(self, rate_hz: float, *, blending: bool = False) -> float:
-        """Return the load at a control rate, as a share of the bus."""
-        steady = self.steady + self.blend * blending
-        return (self.axes * (self.cyclic * rate_hz + steady) + self.other) / BITRATE
-
-    def rate_max_hz(self) -> float:
-        """Return the highest control rate that the bus carries, blends included; 0: none."""
-        rates = (
-            (most * BITRATE - self.other - self.axes * each) / (self.axes * self.cyclic)
-            for most, each in self._limits()
-        )
-        return max(0.0, min(rates))
-
-    def axes_max(self, rate_hz: float) -> int:
-        """Return how many axes the bus carries at a control rate, blends included."""
-        counts = (
-            math.floor((most * BITRATE - self.other) / (self.cyclic * rate_hz + each))
-            for most, each in self._limits()
-        )
-        return max(0, min(counts))
-
-    def _limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return what share may be taken, and what each axis takes whatever the rate, bit/s."""
-        return ((LOAD_MAX, self.steady), (BLEND_MAX, self.steady + self.blend))
+    @property
+    def fits(self) -> bool:
+        """True if the bus carries it."""
+        return self.steady <= LOAD_MAX and self.blending <= BLEND_MAX
 
 
 def frame_bits(data_bytes: int) -> float:
@@ -78,7 +51,12 @@ def frame_bits(data_bytes: int) -> float:
 
 
 def bus_load(
-    axes: int, *, onboard: bool, heartbeat_period_ms: float, loadcell_rate_hz: float = 0.0
+    axes: int,
+    rate_hz: float,
+    *,
+    onboard: bool,
+    heartbeat_period_ms: float,
+    loadcell_rate_hz: float = 0.0,
 ) -> BusLoad:
     """Return the load of a bus: per cycle, an estimate from each axis and a target to it.
 
@@ -87,44 +65,39 @@ def bus_load(
     """
     full, half = frame_bits(8), frame_bits(4)
     gains = full + half if onboard else 0.0
-    return BusLoad(
-        cyclic=full + (full if onboard else half),
-        steady=1e3 / heartbeat_period_ms * full + GAINS_HZ * gains,
-        blend=(BLEND_HZ - GAINS_HZ) * gains,
-        other=LOADCELL_FRAMES * loadcell_rate_hz * full,
-        axes=axes,
-    )
+    cyclic = rate_hz * (full + (full if onboard else half)) + 1e3 / heartbeat_period_ms * full
+    other = LOADCELL_FRAMES * loadcell_rate_hz * full
+    steady, blending = (axes * (cyclic + hz * gains) + other for hz in (GAINS_HZ, BLEND_HZ))
+    return BusLoad(steady / BITRATE, blending / BITRATE)
 
 
 def check_buses(file: str, config: RobotConfig) -> None:
     """Refuse a bus that cannot carry the modules on it: ConfigError says what it can carry."""
-    if config.joint_service.driver != "odrive_can":
-        return
-    modules: dict[str, int] = {}
-    names: dict[str, str] = {}
-    for module in config.module:
-        channel = config.can[module.bus].channel
-        modules[channel] = modules.get(channel, 0) + 1
-        names.setdefault(channel, module.bus)
     service = config.joint_service
+    if service.driver != "odrive_can":
+        return
+    buses: dict[str, list[str]] = {}
+    for module in config.module:
+        buses.setdefault(config.can[module.bus].channel, []).append(module.bus)
     sensor = config.can[config.harness.bus].channel
-    for channel, count in modules.items():
-        load = bus_load(
-            2 * count,
-            onboard=service.loop == "onboard",
-            heartbeat_period_ms=config.drive.heartbeat_period_ms,
-            loadcell_rate_hz=config.harness.rate_hz if channel == sensor else 0.0,
-        )
-        rate_hz = service.rate_hz
-        carried, rate_max_hz = load.axes_max(rate_hz) // 2, load.rate_max_hz()
-        if carried < count:
+    for channel, names in buses.items():
+        loads = [
+            bus_load(
+                2 * count,
+                service.rate_hz,
+                onboard=service.loop == "onboard",
+                heartbeat_period_ms=config.drive.heartbeat_period_ms,
+                loadcell_rate_hz=config.harness.rate_hz if channel == sensor else 0.0,
+            )
+            for count in range(1, len(names) + 1)
+        ]
+        load, carried = loads[-1], sum(load.fits for load in loads)
+        if not load.fits:
             raise ConfigError(
                 file,
-                f"can.{names[channel]}",
-                f"{count} module{'s' if count > 1 else ''} at {rate_hz:g} Hz would load it to "
-                f"{load.share(rate_hz):.0%} of 1 Mbit/s"
-                f" ({load.share(rate_hz, blending=True):.0%} while gains blend)",
-                f"at most {LOAD_MAX:.0%} ({BLEND_MAX:.0%}): {carried} "
-                f"module{'s' if carried != 1 else ''} on a bus at this rate, or "
-                f"joint_service.rate_hz of at most {math.floor(rate_max_hz)} Hz",
+                f"can.{names[0]}",
+                f"{len(names)} modules at {service.rate_hz:g} Hz would load it to "
+                f"{load.steady:.0%} of 1 Mbit/s ({load.blending:.0%} while gains blend)",
+                f"at most {LOAD_MAX:.0%} ({BLEND_MAX:.0%}): {carried} modules on a bus at this "
+                "rate, or a lower joint_service.rate_hz",
             )

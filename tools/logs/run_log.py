@@ -200,11 +200,7 @@ class RunLog:
     def gaps(self) -> dict[str, KeyCount]:
         """Return counts, gaps and restarts of every key with messages, from the file itself."""
         found: dict[str, KeyCount] = {}
-        for key, series in self._series.items():
-            if series.seq:
-                found[key] = KeyCount(several=topics.several_may_write(key))
-                for seq in series.seq:
-                    found[key].feed(seq)
+        self.count_into(found)
         return found
 
     def until(self, received_ns: int) -> RunLog:
