@@ -1,4 +1,4 @@
-"""Executes a service of a run again, whichever it is; also in ranges of time side by side.
+"""Executes services of a run again, in ranges of time that can be executed side by side.
 
 Each range begins a little before its begin, at the memory that the services recorded there, and
 what comes before its begin is not counted. So every tick is executed once, from a memory that the
@@ -12,10 +12,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
-from services.planner.controller import Controller
+from services.planner.controller import Controller, controller_maker
 from shared.config.robot_config import RobotConfig
 from tools.logs.reexecution.compare import ReexecutionResult
 from tools.logs.reexecution.joint import JointExecution
+from tools.logs.reexecution.params import with_params
 from tools.logs.reexecution.planner import PlannerExecution
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import MARGIN_S, NOTHING, RunLog, RunPart, divided, parts_of, robot_of
@@ -45,33 +46,47 @@ LEAD_S: Final = 2.5
 
 
 class RangeTask(NamedTuple):
-    """One range of a run."""
+    """One range of a run, and what executes it."""
 
     run: Path
     part: RunPart
     services: tuple[str, ...]
-    tolerance: float
+    tolerance: float = 0.0
+    params: tuple[str, ...] = ()
+    """Changed keys of the robot file (`with_params`)."""
+    controller: str = ""
+    """Somebody's own controller in the place of the law, as `--controller` takes it."""
+
+    @property
+    def is_changed(self) -> bool:
+        """True if something else is executed than was recorded."""
+        return bool(self.params or self.controller)
 
 
 def ranges_of(
-    index: RunIndex,
-    part: RunPart,
-    services: tuple[str, ...],
-    tolerance: float,
-    workers: int,
-    *,
-    range_s: float = RANGE_S,
+    index: RunIndex, whole: RangeTask, workers: int, range_s: float = RANGE_S
 ) -> list[RangeTask]:
-    """Return a part of a run in ranges, in their order."""
-    pieces = divided(index, part, range_s, workers)
-    return [RangeTask(index.path, piece, services, tolerance) for piece in pieces]
+    """Return a task in ranges, in their order.
+
+    What a parameter or a controller changes goes on from one range to the next: it stays one.
+    """
+    if whole.is_changed:
+        return [whole]
+    pieces = divided(index, whole.part, range_s, workers)
+    return [whole._replace(part=piece) for piece in pieces]
 
 
 def execute_range(task: RangeTask) -> list[ReexecutionResult]:
     """Execute one range; return a result for each service, in the order of their names."""
     index = _index_of(task.run)
-    robot = robot_of(RunLog(index, NOTHING, as_sent=True))
-    executions = [execution_of(robot, name, task.tolerance) for name in task.services]
+    recorded = robot_of(RunLog(index, NOTHING, as_sent=True))
+    robot = with_params(recorded, task.params, str(task.run)) if task.params else recorded
+    make = controller_maker(task.controller, robot) if task.controller else None
+    exact = not task.is_changed
+    executions = [
+        execution_of(robot, name, task.tolerance, exact=exact, controller=make)
+        for name in task.services
+    ]
     begin_s = task.part.begin_s
     if begin_s > 0.0:
         before = RunPart(max(0.0, begin_s - LEAD_S), begin_s)

@@ -10,7 +10,6 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from services.planner.controller import controller_maker
 from shared import revision
 from shared.exceptions import FAULT_EXIT_CODE, RunError
 from shared.joints import MODULES
@@ -21,17 +20,9 @@ from tools.judge.run_parts import PartFlags, part_of
 from tools.lab.studies.sweeps.pool import cores, results
 from tools.live.experiment import ControllerFlags
 from tools.logs.reexecution.compare import ReexecutionResult, likely_reason, size
-from tools.logs.reexecution.execution import (
-    Execution,
-    RangeTask,
-    execute_range,
-    execution_of,
-    merged,
-    ranges_of,
-)
-from tools.logs.reexecution.params import with_params
+from tools.logs.reexecution.execution import RangeTask, execute_range, merged, ranges_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunPart, has_own_controller, parts_of, robot_of
+from tools.logs.run_log import has_own_controller
 from tools.terminal import Console, marked
 
 SERVICES: Final = ("planner", *MODULES)
@@ -78,14 +69,8 @@ def run(flags: ResimFlags) -> int:
     part = part_of(flags, index)
     chosen = set(flags.service or ("all",))
     names = SERVICES if "all" in chosen else tuple(name for name in SERVICES if name in chosen)
-    # a controller's memory, and what a parameter has changed, go on from one part to the next
-    changed = bool(flags.param or flags.controller)
-    with Progress(console=console, transient=True) as progress:
-        ranges = [] if changed else ranges_of(index, part, names, flags.tolerance, flags.workers)
-        if len(ranges) > 1 and flags.workers > 1:
-            outcomes = _side_by_side(ranges, flags.workers, progress)
-        else:
-            outcomes = _one_by_one(flags, index, part, names, progress)
+    task = RangeTask(index.path, part, names, flags.tolerance, flags.param, flags.controller or "")
+    outcomes = _executed(ranges_of(index, task, flags.workers), flags.workers, console)
     if has_own_controller(index) and flags.controller is None and "planner" in names:
         console.print(
             "a custom controller led this run: the planner is equal only with --controller FILE",
@@ -93,8 +78,8 @@ def run(flags: ResimFlags) -> int:
         )
     console.print(summary(outcomes))
     for outcome in outcomes:
-        tell(outcome, index, console, changed=changed)
-    if not changed and any(outcome.differs for outcome in outcomes):
+        tell(outcome, index, console, changed=task.is_changed)
+    if not task.is_changed and any(outcome.differs for outcome in outcomes):
         _tell_reason(index, console)
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
@@ -106,41 +91,21 @@ def run(flags: ResimFlags) -> int:
     return 0 if all(outcome.equal for outcome in outcomes if outcome.ticks) else FAULT_EXIT_CODE
 
 
-def _side_by_side(
-    ranges: list[RangeTask], workers: int, progress: Progress
-) -> list[ReexecutionResult]:
-    """Execute ranges of the run in worker processes."""
-    task = progress.add_task("executing again", total=len(ranges))
+def _executed(ranges: list[RangeTask], workers: int, console: Console) -> list[ReexecutionResult]:
+    """Execute ranges of the run, side by side if there are several."""
+    if len(ranges) == 1:
+        with Progress(console=console, transient=True) as progress:
+            progress.add_task("executing again", total=None)
+            return execute_range(ranges[0])
     done: dict[RangeTask, list[ReexecutionResult]] = {}
-    for one, results_of_range in results(
-        execute_range, ranges, workers, lambda one: f"from {one.part.begin_s:.0f} s"
-    ):
-        done[one] = results_of_range
-        progress.update(task, advance=1, description=f"executed from {one.part.begin_s:.0f} s")
+    with Progress(console=console, transient=True) as progress:
+        bar = progress.add_task("executing again", total=len(ranges))
+        for one, outcomes in results(
+            execute_range, ranges, workers, lambda one: f"from {one.part.begin_s:.0f} s"
+        ):
+            done[one] = outcomes
+            progress.update(bar, advance=1)
     return merged([done[one] for one in ranges])
-
-
-def _one_by_one(
-    flags: ResimFlags, index: RunIndex, part: RunPart, names: tuple[str, ...], progress: Progress
-) -> list[ReexecutionResult]:
-    """Execute a run's services part by part, here."""
-    executions: list[Execution] = []
-    task = progress.add_task("executing again", total=min(part.end_s, index.length_s))
-    for log in parts_of(index, part, as_sent=True):
-        if not executions:
-            robot = with_params(robot_of(log), flags.param, str(flags.log))
-            make = controller_maker(flags.controller, robot) if flags.controller else None
-            exact = not (flags.param or flags.controller)
-            executions = [
-                execution_of(robot, name, flags.tolerance, exact=exact, controller=make)
-                for name in names
-            ]
-        for execution in executions:
-            progress.update(task, description=f"executing {execution.outcome.service}")
-            for _ in execution.run(log):
-                pass
-        progress.update(task, completed=(log.end_ns - log.began_ns()) / 1e9)
-    return [execution.outcome for execution in executions]
 
 
 def summary(outcomes: list[ReexecutionResult]) -> Table:

@@ -29,6 +29,7 @@ from tests.shared.mcap_log.runs import recorded_in_parts, state
 from tests.tools.exit_codes import exit_code
 from tests.tools.logs.reexecution.executions import executed
 from tools import cli
+from tools.logs.reexecution import execution
 from tools.logs.reexecution.compare import ReexecutionResult
 from tools.logs.reexecution.execution import RangeTask, execute_range, merged, ranges_of
 from tools.logs.reexecution.params import with_params
@@ -100,7 +101,7 @@ def test_ranges_side_by_side_execute_every_tick_once_as_one_after_the_other(
     names = ("planner", "knee_left")
 
     def tasks(range_s: float) -> list[RangeTask]:
-        return ranges_of(log.index, WHOLE, names, 0.0, 4, range_s=range_s)
+        return ranges_of(log.index, RangeTask(log.index.path, WHOLE, names), 4, range_s)
 
     assert [len(tasks(range_s)) for range_s in (1.3, 3.0, 60.0)] == [8, 4, 1], "for each worker"
     found = merged([pickle.loads(pickle.dumps(execute_range(task))) for task in tasks(3.0)])  # noqa: S301
@@ -217,8 +218,8 @@ def test_a_difference_is_told_with_its_likely_reason_and_none_without(
     monkeypatch.setattr(provenance, "packages", lambda: versions | {"numpy": "0.1"})
     assert exit_code(words) == 0
     assert reason not in capsys.readouterr().out
-    other = with_params(with_imu(robot), ["gains.k_p_x=2000"], "")
-    monkeypatch.setattr(resim, "robot_of", lambda _log: other)
+    other = with_params(with_imu(robot), ["law.K_p.x=2000"], "")
+    monkeypatch.setattr(execution, "robot_of", lambda _log: other)
     assert exit_code(words) == FAULT_EXIT_CODE
     assert reason in capsys.readouterr().out
 
@@ -259,7 +260,7 @@ def test_one_file_of_a_split_run_stands_for_itself(directory: Path) -> None:
 def test_a_changed_gain_changes_what_comes_out_and_is_listed(
     directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["log", "resim", str(directory), "--service", "planner", "--param", "gains.k_p_x=2000"]
+    words = ["log", "resim", str(directory), "--service", "planner", "--param", "law.K_p.x=2000"]
     assert cli.main(words) == 0
     text = capsys.readouterr().out
     assert "planner, first at" in text
