@@ -30,7 +30,7 @@ from shared.can.drive_settings import (
 )
 from shared.config.can_load import BLEND_HZ, LOAD_MAX, bus_load, frame_bits
 from shared.config.robot_config import RobotConfig
-from shared.exceptions import ConfigError
+from shared.exceptions import ConfigError, DriveError
 from shared.joints import MODULES
 from tests.shared.test_config import Table, load_changed
 
@@ -144,19 +144,19 @@ def test_a_value_fits_to_within_single_precision(
     assert WantedSetting("x", 1.2, "", compare).fits(found) is fits
 
 
-def test_a_planted_setting_is_kept_by_that_drive_alone() -> None:
-    settings = Settings()
-    preset(settings, "knee_left.axis0.config.can.encoder_rate_ms=7")
-    preset(settings, "knee_left.axis1.config.enable_watchdog=TRUE")
-    preset(settings, "hip_left.config.dc_max_positive_current=inf")
+def test_a_saved_setting_is_kept_by_its_drive_alone_and_only_a_value_of_its_kind() -> None:
+    settings, period = Settings(), "axis0.config.can.encoder_rate_ms"
     index = MODULES.index("knee_left")
     settings.set(index, period, 7)
     settings.save(index)
     settings.set(index, period, 8)
     settings.restore(index)
-    assert settings.get(index, "axis0.config.can.encoder_rate_ms") == 7
-    assert settings.get(index, "axis1.config.enable_watchdog") is True
-    assert settings.get(0, "axis0.config.can.encoder_rate_ms") == 10
+    assert (settings.get(index, period), settings.get(0, period)) == (7, 10)
+    with pytest.raises(DriveError, match=r"nearest is axis0\.controller\.config\.vel_limit"):
+        settings.get(index, "axis0.vel_limit")
+    for name, value in ((period, 1.5), ("axis0.controller.config.vel_limit", math.nan)):
+        with pytest.raises(DriveError, match=r"int|float"):
+            settings.set(index, name, value)
 
 
 def bits_on_the_wire(can_id: int, data: bytes) -> int:
@@ -205,7 +205,7 @@ def test_the_usual_frame_length_and_the_loads_are_those_of_the_design() -> None:
     assert torques(12, 1000.0 / 3.0) < LOAD_MAX < torques(12, 500.0)
 
 
-def design(axes: int) -> BusLoad:
+def torques(axes: int, rate_hz: float) -> float:
     """Return the load of torques alone, with heartbeats as the drives are shipped."""
     load = bus_load(axes, rate_hz, onboard=False, heartbeat_period_ms=100)
     assert load.blending == load.steady, "there are no gains"

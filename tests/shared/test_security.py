@@ -23,7 +23,7 @@ from shared.bus.credentials import Credentials, read_credentials
 from shared.bus.messages import Estop
 from shared.bus.security import access_control, services_here, token_key
 from shared.bus.session import open_session
-from shared.bus.tls_probe import LinkWatch, refusal
+from shared.bus.tls_probe import own_fault, refusal
 from shared.bus.topics import PRINCIPALS, all_keys
 from shared.config import files as config_file
 from shared.config.robot_config import RobotConfig
@@ -519,21 +519,21 @@ def test_why_a_link_does_not_come_is_told_truly(pair: Pair, fault: str) -> None:
     assert refusal(pair.own("planner"), pair.knee) == "Connection refused"
 
 
-def test_a_service_logs_a_refused_link_once_and_a_session_knows_its_links(
-    pair: Pair, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("when", "words"),
+    [
+        ({}, ""),
+        ({"from_day": 10}, "is not valid yet, by this host's clock"),
+        ({"from_day": -40, "days": 20}, "has expired"),
+        ({"foreign": True}, "is of another authority"),
+    ],
+)
+def test_a_certificate_that_this_host_does_not_believe_is_told(
+    pair: Pair, when: dict[str, int], words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO")
-    linked: set[str] = set()
-    watch = LinkWatch(pair.own("planner"), {"knee_left": pair.knee}, linked.__contains__, 0.02)
-    refused = f"no link with knee_left at {pair.knee}: Connection refused"
-    assert comes_true(lambda: refused in caplog.text)
-    time.sleep(0.2)
-    assert caplog.text.count("Connection refused") == 1
-    linked.add(pair.knee)
-    assert comes_true(lambda: "link with knee_left is there" in caplog.text)
-    watch.end()
-    with open_session(pair.host("planner"), "planner", pair.folder) as planner:
-        with open_session(pair.host("knee_left"), "knee_left", pair.folder):
-            assert comes_true(lambda: planner.is_linked(pair.knee))
-            assert not planner.is_linked(pair.robot.bus.endpoints["hip_left"])
-        assert comes_true(lambda: not planner.is_linked(pair.knee))
+    pair.replace("planner", **when)  # type: ignore[arg-type]
+    found = own_fault(pair.own("planner"))
+    assert found.startswith(words)
+    assert bool(words) is bool(found)
+    with open_session(pair.host("planner"), "planner", pair.folder):
+        assert ("no link over TLS" in caplog.text) is bool(words)

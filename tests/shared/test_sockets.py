@@ -95,54 +95,6 @@ def test_no_tcp_link_of_the_bus_lingers_when_it_is_given_up(
         assert comes_true(lambda: links() == [True, True])
 
 
-# ---- floods
-
-HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  inode\n"
-
-
-def row(number: int, local: str, remote: str, state: str, inode: int) -> str:
-    queues = "00000000:00000000 00:00000000 00000000  1000        0"
-    return f"{number:4}: {local} {remote} {state} {queues} {inode} 1\n"
-
-
-def kernel(folder: Path, drops: int, rows: list[str], rows6: list[str]) -> Path:
-    """Write what Linux has in /proc/net."""
-    (folder / "tcp").write_text(HEAD + "".join(rows))
-    (folder / "tcp6").write_text(HEAD + "".join(rows6))
-    words = f"TcpExt: SyncookiesSent ListenOverflows ListenDrops Other\nTcpExt: 1 2 {drops} 4\n"
-    (folder / "netstat").write_text(words + "IpExt: InOctets\nIpExt: 7\n")
-    return folder
-
-
-LISTENS = row(0, "0100007F:1D17", "00000000:0000", "0A", 5)
-LINK = row(1, "0100007F:1D17", "0200007F:C001", "01", 6)
-FLOOD = [row(n, "0100007F:1D17", f"4200007F:{0xD000 + n:04X}", "01", 0) for n in range(2, 9)]
-FLOOD6 = [row(1, "0" * 24 + "01000000:1D17", "0" * 24 + "02000000:D001", "08", 0)]
-ELSEWHERE = [row(9, "0100007F:0050", "0900007F:D009", "01", 0)]
-
-
-def test_a_flood_is_told_with_its_rate_and_who_begins_connections(tmp_path: Path) -> None:
-    arrivals = Arrivals({7447}, kernel(tmp_path, 100, [LISTENS, LINK], []))
-    assert arrivals.flood(0) == ""
-    kernel(tmp_path, 420, [LISTENS, LINK, *FLOOD, *ELSEWHERE], FLOOD6)
-    words = arrivals.flood(NS_PER_S // 2)
-    assert words == (
-        "flood: 640 connections/s to this host turned away; connections begun by "
-        "127.0.0.66 (7), ::2 (1)"
-    )
-    assert arrivals.flood(NS_PER_S) == "", "it is over"
-
-
-@pytest.mark.parametrize(("ports", "drops"), [({7447}, 105), (set(), 900)])
-def test_a_start_of_the_fleet_or_a_host_without_ports_is_no_flood(
-    tmp_path: Path, ports: set[int], drops: int
-) -> None:
-    arrivals = Arrivals(ports, kernel(tmp_path, 100, [LISTENS], []))
-    assert arrivals.flood(0) == ""
-    kernel(tmp_path, drops, [LISTENS, *FLOOD], [])
-    assert arrivals.flood(NS_PER_S) == ""
-
-
 def test_the_other_ends_of_a_process_are_those_of_the_kernel() -> None:
     with ExitStack() as stack:
         listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import contextlib
 from collections.abc import Sequence
 from typing import Annotated, Any, Final, NamedTuple
 
