@@ -16,8 +16,9 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import FAULT_EXIT_CODE, ConfigError
 from shared.extras import require
 from shared.places import refuse_shipped
-from tools.flags import ConfigFlags, option
+from tools.flags import Arg, ConfigFlags, option
 from tools.lab.design import split_program
+from tools.lab.design.body_stiffness import BodyStiffness, for_robot
 from tools.lab.design.dynamic_certificate import BLIND, BLIND_S, HELD, TRACK, DynamicCertificate
 from tools.terminal import Console
 
@@ -27,11 +28,21 @@ SHOWN = 6
 """Heights in the printed table."""
 
 
+STIFFNESS_ROWS = (
+    ("theta_max", "rad", "largest lean the ankles' torque can hold"),
+    ("theta_edge", "rad", "lean with the COM over the sole's edge"),
+    ("tau_edge", "N m", "each ankle's torque there"),
+    ("K_ank_min", "N m/rad", "least stiffness of each ankle"),
+    ("K_min", "N/m", "least stiffness of the body"),
+    ("K_tau_max", "N/m", "stiffness that gives tau_max at the edge"),
+)
+
 EXAMPLES: Final = """
 xrl gains
 xrl gains --config lab.toml
 xrl gains --config lab.toml --damping-of deploy/robot.gains.json
 xrl gains --check
+xrl gains --stiffness
 """
 
 
@@ -41,13 +52,17 @@ class GainsFlags(ConfigFlags):
     damping_of: Path | None = None
     """take damping and coupling from another schedule, such as deploy/robot.gains.json, and check
     them with the dynamic certificate; without it the verb searches for them (two minutes)"""
-    check_only: Annotated[bool, option("--check")] = False
+    check_only: Annotated[bool, option("--check", exclusive="only")] = False
     """only say whether the schedule fits the robot"""
+    stiffness: Annotated[bool, Arg(exclusive="only")] = False
+    """only print how stiff the body must be to balance (paper section IV)"""
 
 
 def run(flags: GainsFlags) -> int:
     """Write the schedule beside the robot file; with --check only say if it would have to be."""
     robot = config_file.load_without_schedule(flags.config)
+    if flags.stiffness:
+        return _show_stiffness(robot)
     path = gain_schedule.path_beside(flags.config)
     console = Console()
     if flags.check_only:
@@ -125,3 +140,38 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
         f"while an encoder is blind, {1e3 * BLIND_S:.0f} ms, a motion grows to at most "
         f"{math.exp(BLIND_S * blind):.2f} times its size"
     )
+
+
+def _show_stiffness(robot: RobotConfig) -> int:
+    """Print the design of the body for x and y."""
+    design = for_robot(robot)
+    table = Table(title="Body stiffness, legs straight (paper section IV)", title_justify="left")
+    table.add_column("")
+    for direction in design:
+        table.add_column(direction, justify="right", no_wrap=True)
+    table.add_column("unit")
+    table.add_column("what")
+    for key, unit, what in STIFFNESS_ROWS:
+        table.add_row(key, *(_stiffness(key, row) for row in design.values()), unit, what)
+    console = Console()
+    console.print(table)
+    edge = math.degrees(design["y"].theta_edge)
+    console.print(
+        f"theta_edge along y: {edge:.2f} deg. The paper's numbers are the column y: its "
+        "theta_edge is that of w_foot / 2, though its formula prints l_foot.",
+        style="dim",
+    )
+    for direction, stiffness in zip(design, robot.law.K_p, strict=False):
+        least = design[direction].K_min
+        word = "above" if stiffness > least else "BELOW"
+        console.print(f"law.K_p along {direction}: {stiffness:g} N/m, {word} {least:.0f} N/m")
+    return 0
+
+
+def _stiffness(key: str, row: BodyStiffness) -> str:
+    value: float = getattr(row, key)
+    if math.isnan(value):
+        return "any"
+    if key.startswith("theta"):
+        return f"{value:.4f}"
+    return f"{value:.2f}" if value < 1000 else f"{value:.0f}"
