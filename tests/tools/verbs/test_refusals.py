@@ -122,7 +122,6 @@ REFUSALS: Final = {
     "log play LOG --from 9": "has nothing from 9 to inf s",
     "log play LOG --topic joint/*/sate": "no topic is so named",
     "log play LOG --topic estop": "none of these topics has a message",
-    "log play LOG --duration 0": "a number of at least 1e-09 s",
     "topic echo": "TOPIC",
     "topic echo foo": "foo",
     "topic echo estop --field mode": "--field mode: estop has no such field; it has",
