@@ -22,7 +22,7 @@ from shared.exceptions import RunError
 from tools.flags import Arg, Degrees, Duration
 from tools.lab.design.push_limit import PushLimits, limits_along
 from tools.lab.studies.sweeps import study
-from tools.lab.studies.sweeps.figures import NOBODY, Ending, Observer, ending_of
+from tools.lab.studies.sweeps.figures import NOBODY, Ending, Observer, ending_of, until_fall
 from tools.lab.studies.sweeps.plants import torso_at
 from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
@@ -155,7 +155,7 @@ def _stands(trial: PushTrial, robot: RobotConfig, start: FleetMoment, force_n: f
     scenario = trial.scenario(robot, force_n)
     fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=trial.plant)
     fleet.resume(start)
-    rows = list(NOBODY.rows_that_count(fleet.run(), -math.inf))
+    rows = until_fall(fleet.run())
     return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD
 
 
