@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -50,9 +51,7 @@ class Check:
     def __init__(self, command: tuple[str, ...], *, beside: bool = False) -> None:
         """Start it in a process group of its own, so that it gets one SIGINT from `stop`."""
         words = [word for word in command if not word.startswith("--durations")]
-        if len(words) > SHOWN_WORDS:
-            words = [*words[:SHOWN_WORDS], "..."]
-        self.name = " ".join(f"'{word}'" if " " in word else word for word in words)
+        self.name = shlex.join(words[:SHOWN_WORDS]) + " ..." * (len(words) > SHOWN_WORDS)
         self._is_pytest = command[0] == "pytest"
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process
         self._begun_s, self.took_s = time.monotonic(), 0.0

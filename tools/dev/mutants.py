@@ -191,17 +191,12 @@ def _mutmut_run(folder: Path, words: Sequence[str]) -> None:
 
 
 def _mutmut(folder: Path, *words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "mutmut", *words],
-        cwd=folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return done.stdout
+    command = [sys.executable, "-m", "mutmut", *words]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout
 
 
 def _statuses(folder: Path) -> list[tuple[str, str]]:
     """Return each mutant of a group with mutmut's word for what became of it."""
-    if not folder.exists():
-        return []
     lines = _mutmut(folder, "results", "--all", "true").splitlines()
     pairs = [line.strip().partition(": ") for line in lines if "__mutmut_" in line]
     return [(name, status) for name, _, status in pairs]

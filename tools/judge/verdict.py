@@ -30,10 +30,7 @@ from tools.logs.impairment_intervals import Impaired, impairments, touches
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, parts_of, robot_of
 
-KILLED, RESTARTED, FAULTED = (
-    RunEventKind.KILLED, RunEventKind.RESTARTED, RunEventKind.FAULTED,
-)  # fmt: skip
-
+KILLED, RESTARTED = RunEventKind.KILLED, RunEventKind.RESTARTED
 REAL_TIME_FACTOR_MIN: Final = 0.99
 NEXT_CYCLE_MS: Final = 2.0
 """In virtual time a module sees the end of a process on its host in its next cycle, after up to

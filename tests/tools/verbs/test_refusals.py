@@ -155,7 +155,6 @@ REFUSALS: Final = {
     "study latency --control mine": "'mine': one of distributed, diagonal, centralised",
     "study latency --control ,": "name at least one of distributed",
     "study latency --delay 0-200": "numbers from 0 to 60000 with commas",
-    "study latency --lead-easing 2": "lead_easing",
     "study crash --only kill-kne_left": (
         "--only kill-kne_left: no such case; perhaps kill-knee_left, kill-ankle_left, "
         "kill-hip_left; `xrl study crash --list` has all"

@@ -114,21 +114,16 @@ def _section(hint: Any) -> type[msgspec.Struct] | None:
 
 
 def _sections(whole: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
-    for name, hint in get_type_hints(whole, include_extras=True).items():
+    hints = get_type_hints(whole, include_extras=True)
+    for name, hint in hints.items():
         section = _section(hint)
-        if section is None or name == _NOT_IN_THE_FILE or _same_as_sibling(whole, name):
+        is_shown = list(hints.values()).index(hint) < list(hints).index(name)  # by a sibling
+        if section is None or name == _NOT_IN_THE_FILE or is_shown:
             continue
         yield f"## [{prefix}{name}]\n"
         yield summary(section) + "\n"
         yield from _table(section, f"{prefix}{name}.", shipped)
         yield from _sections(section, f"{prefix}{name}.", shipped)
-
-
-def _same_as_sibling(section: type[msgspec.Struct], name: str) -> bool:
-    """Return True if an earlier field has the same struct: its table is shown once."""
-    hints = get_type_hints(section, include_extras=True)
-    earlier = [other for other in hints if other == name or hints[other] == hints[name]]
-    return earlier[0] != name
 
 
 def _table(section: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Iterator[str]:
@@ -166,7 +161,8 @@ def _described(hint: Any) -> tuple[str, str, str]:
         limits = next(meta for meta in args[1:] if isinstance(meta, Range))
         return args[0].__name__, limits.unit, f"{limits.low:g} .. {limits.high:g}"
     if origin is Literal:
-        return " or ".join(f"`{_toml(value)}`" for value in args), "", ""
+        texts = (f'"{value}"' if isinstance(value, str) else value for value in args)
+        return " or ".join(f"`{text}`" for text in texts), "", ""
     if origin is tuple:
         return _array(args)
     if origin is dict:
@@ -182,7 +178,3 @@ def _array(args: tuple[Any, ...]) -> tuple[str, str, str]:
     kind = parts[0][0]
     units, ranges = (list(dict.fromkeys(part[i] for part in parts)) for i in (1, 2))
     return f"array of {len(parts)}: {kind}", ", ".join(units), "; ".join(ranges)
-
-
-def _toml(value: object) -> str:
-    return f'"{value}"' if isinstance(value, str) else str(value)

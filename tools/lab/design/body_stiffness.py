@@ -11,7 +11,7 @@ not count towards m, because they stand still:
     K_x(tau)   = 2 tau_max / (theta_edge z^2)    uses tau_max at the edge
 
 The paper's formula for theta_edge prints l_foot, but its text and its number (2.81 deg) take w_foot
-/ 2. Here the caller passes the half of the sole to use.
+/ 2. Here x takes the one and y the other.
 """
 
 from __future__ import annotations
@@ -39,46 +39,27 @@ class BodyStiffness(NamedTuple):
     """N/m; with it the ankles give tau_max at the sole's edge."""
 
 
-def body_stiffness(
-    *, mass: float, height: float, half_sole: float, tau_max: float
-) -> BodyStiffness:
-    """Return the least body stiffness that balances.
-
-    Args:
-        mass: that leans, kg.
-        height: of its COM above the ankles, m.
-        half_sole: from the ankle to the sole's edge in this direction, m.
-        tau_max: of one ankle, N m.
-    """
-    weight_moment = mass * GRAVITY * height
-    sine = 2.0 * tau_max / weight_moment
-    theta_edge = math.atan(half_sole / height)
-    tau_edge = 0.5 * weight_moment * math.sin(theta_edge)
-    K_ank_min = tau_edge / theta_edge
-    return BodyStiffness(
-        theta_max=math.asin(sine) if sine <= 1.0 else math.nan,
-        theta_edge=theta_edge,
-        tau_edge=tau_edge,
-        K_ank_min=K_ank_min,
-        K_min=2.0 * K_ank_min / height**2,
-        K_tau_max=2.0 * tau_max / (theta_edge * height**2),
-    )
-
-
 def for_robot(config: RobotConfig) -> dict[str, BodyStiffness]:
-    """Return the design for x and y of a robot, upright with straight legs.
+    """Return the least body stiffness that balances along x and y, upright with straight legs.
 
     The soles stand side by side: x uses half their length, y half their width. The legs' spread
     helps in y and is left out, as in the paper.
     """
-    geometry = config.geometry
-    mass = config.torso_mass + 2 * config.mass.module
-    return {
-        direction: body_stiffness(
-            mass=mass,
-            height=geometry.l1 + geometry.l2,
-            half_sole=half_sole,
-            tau_max=config.joint.tau_module_max,
+    geometry, tau_max = config.geometry, config.joint.tau_module_max
+    height = geometry.l1 + geometry.l2
+    weight_moment = (config.torso_mass + 2 * config.mass.module) * GRAVITY * height
+    sine = 2.0 * tau_max / weight_moment
+    found = {}
+    for direction, half_sole in (("x", geometry.l_foot / 2), ("y", geometry.w_foot / 2)):
+        theta_edge = math.atan(half_sole / height)
+        tau_edge = 0.5 * weight_moment * math.sin(theta_edge)
+        K_ank_min = tau_edge / theta_edge
+        found[direction] = BodyStiffness(
+            theta_max=math.asin(sine) if sine <= 1.0 else math.nan,
+            theta_edge=theta_edge,
+            tau_edge=tau_edge,
+            K_ank_min=K_ank_min,
+            K_min=2.0 * K_ank_min / height**2,
+            K_tau_max=2.0 * tau_max / (theta_edge * height**2),
         )
-        for direction, half_sole in (("x", geometry.l_foot / 2), ("y", geometry.w_foot / 2))
-    }
+    return found

@@ -235,15 +235,13 @@ class DynamicCertificate:
         drivetrain, timing = self.drivetrain(c.stiffness), self.timing(c.delay_s)
         return SampledLoop(stand, half, feedback, drivetrain, timing, c.hand)
 
-    def conditions(
-        self, modes: Sequence[str] = TRACK + HELD + BLIND, *, margins: bool = True
-    ) -> Iterator[Condition]:
-        """Yield every condition; without `margins`, nominal gains and delays only."""
+    def conditions(self, modes: Sequence[str] = TRACK + HELD + BLIND) -> Iterator[Condition]:
+        """Yield every condition."""
         for cases_of, own in ((self._in_track, TRACK), (self._in_hold, HELD)):
             if not set(own) <= set(modes):
                 continue
             for case in itertools.product(self._nodes, self._wanted.stiffness, (0, 1)):
-                yield from cases_of(*case, margins=margins)
+                yield from cases_of(*case)
         if set(BLIND) <= set(modes):
             for node, k, mode in itertools.product(self._nodes, self._wanted.stiffness, BLIND):
                 yield Condition(mode, node, 2, k, DELAY_MIN_S, NO_HAND, NOMINAL)
@@ -275,7 +273,8 @@ class DynamicCertificate:
 
     def sway(self, design: Design) -> float:
         """Return the rate (1/s, negative) of the TRACK oscillation with the slowest decay."""
-        cases = self.conditions(TRACK, margins=False)
+        cases = (c for c in self.conditions(TRACK) if c.gains == NOMINAL and c.integral
+                 and c.delay_s <= self._wanted.delay_ms / 1e3)  # fmt: skip
         return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
 
     def judge(self, condition: Condition, design: Design) -> DynamicVerdict:
@@ -287,9 +286,7 @@ class DynamicCertificate:
             allowed = math.log(BLIND_GROWTH_MAX) / BLIND_S
         return DynamicVerdict(growth, condition, growth.rate - allowed)
 
-    def _in_track(
-        self, node: StiffnessNode, stiffness: float, half: int, *, margins: bool
-    ) -> Iterator[Condition]:
+    def _in_track(self, node: StiffnessNode, stiffness: float, half: int) -> Iterator[Condition]:
         wanted = self._wanted
         delay = wanted.delay_ms / 1e3
         hands = self._hands if half == 0 else self._hands[:1]
@@ -297,22 +294,18 @@ class DynamicCertificate:
             case = Condition("TRACK", node, half, stiffness, DELAY_MIN_S, hand, NOMINAL)
             yield case
             yield case._replace(delay_s=delay)
-            if margins:
-                yield case._replace(delay_s=wanted.delay_margin * delay)
-                if half == 1:
-                    yield case._replace(delay_s=wanted.delay_margin * delay, integral=False)
-                yield case._replace(delay_s=delay, gains=Gains(coupling=wanted.gain_margin))
-                yield case._replace(gains=Gains(torque=wanted.gain_margin))
-                yield case._replace(delay_s=delay, gains=Gains(torque=wanted.gain_margin))
+            yield case._replace(delay_s=wanted.delay_margin * delay)
+            if half == 1:
+                yield case._replace(delay_s=wanted.delay_margin * delay, integral=False)
+            yield case._replace(delay_s=delay, gains=Gains(coupling=wanted.gain_margin))
+            yield case._replace(gains=Gains(torque=wanted.gain_margin))
+            yield case._replace(delay_s=delay, gains=Gains(torque=wanted.gain_margin))
 
-    def _in_hold(
-        self, node: StiffnessNode, stiffness: float, half: int, *, margins: bool
-    ) -> Iterator[Condition]:
+    def _in_hold(self, node: StiffnessNode, stiffness: float, half: int) -> Iterator[Condition]:
         for mode in HELD:
             case = Condition(mode, node, half, stiffness, DELAY_MIN_S, NO_HAND, NOMINAL)
             yield case
-            if margins:
-                yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
+            yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
 
     def drivetrain(self, stiffness: float) -> DrivetrainModel:
         """Return the drivetrain of a stiffness, N m/rad."""

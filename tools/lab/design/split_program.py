@@ -251,8 +251,12 @@ def choose_design(
         if not verdict.stable:
             raise RunError(f"no stable gains found: {verdict.words()}; lower {lower}")
     checked = _sample_nodes(nodes)
+    wanted = config.robustness
+    few = sorted({min(wanted.stiffness), NOMINAL_STIFFNESS, max(wanted.stiffness)})
+    wanted = msgspec.structs.replace(wanted, stiffness=tuple(few))
+    with_few_drivetrains = msgspec.structs.replace(config, robustness=wanted)
     while True:
-        reduced = DynamicCertificate(_with_few_drivetrains(config), checked)
+        reduced = DynamicCertificate(with_few_drivetrains, checked)
         found = _descend(reduced, START, report)
         report("checking every pose and drivetrain")
         verdict = full.worst(found, TRACK, stop_above=0.0)
@@ -319,15 +323,6 @@ def _neighbours(design: Design) -> Iterator[Design]:
         bandwidth, damping = design.coupling
         yield design._replace(coupling=CouplingGains(bandwidth * ratio, damping))
         yield design._replace(coupling=CouplingGains(bandwidth, damping * ratio))
-
-
-def _with_few_drivetrains(config: RobotConfig) -> RobotConfig:
-    """Return the robot with its softest, nominal and stiffest drivetrain only."""
-    robustness = config.robustness
-    stiffnesses = sorted({min(robustness.stiffness), NOMINAL_STIFFNESS, max(robustness.stiffness)})
-    return msgspec.structs.replace(
-        config, robustness=msgspec.structs.replace(robustness, stiffness=tuple(stiffnesses))
-    )
 
 
 def _sample_nodes(nodes: list[StiffnessNode]) -> list[StiffnessNode]:

@@ -22,7 +22,7 @@ from shared.config.scenarios import Kill, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
 from shared.state import copied
-from tools.lab.studies.sweeps.figures import NOBODY, sole_tilt_max_rad
+from tools.lab.studies.sweeps.figures import sole_tilt_max_rad, until_fall
 from tools.logs.hand_path import HandRow
 from tools.logs.reexecution.compare import ReexecutionResult
 from tools.logs.reexecution.joint import JointExecution
@@ -184,7 +184,7 @@ def counterfactual_of(task: Task) -> Counterfactual:
         task.robot, scenario, BASE, plant=task.plant, hand=task.hand, planner_beside=True
     )
     fleet.resume(FleetMoment(moment.state, moment.modules, moment.planner))
-    rows = list(NOBODY.rows_that_count(fleet.run(), -math.inf))
+    rows = until_fall(fleet.run())
     fell = rows.pop() if rows and rows[-1].fallen else None
     return Counterfactual(
         at_s=moment.at_s,

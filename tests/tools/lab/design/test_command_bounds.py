@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
-from tools.lab.design.body_stiffness import body_stiffness, for_robot
 
 from services.joint.envelope import Envelope
 from services.planner.intents import OperatorRequest
@@ -14,6 +14,7 @@ from shared.bus.messages import Outside
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tests.planner.states import SESSION, START_NS, closed, receive_all
+from tools.lab.design.body_stiffness import for_robot
 
 ROUNDING = 1e-3
 """The paper rounds theta_edge to 0.0490 and g to 9.8 on the way."""
@@ -29,8 +30,9 @@ def test_the_papers_numbers_come_out(robot: RobotConfig) -> None:
     assert design.K_tau_max == pytest.approx(2810.0, rel=ROUNDING)
 
 
-def test_ankles_too_strong_to_be_overpowered_have_no_largest_lean() -> None:
-    assert math.isnan(body_stiffness(mass=10.0, height=0.5, half_sole=0.1, tau_max=100.0).theta_max)
+def test_ankles_too_strong_to_be_overpowered_have_no_largest_lean(robot: RobotConfig) -> None:
+    joint = msgspec.structs.replace(robot.joint, tau_module_max=1e4)
+    assert math.isnan(for_robot(msgspec.structs.replace(robot, joint=joint))["y"].theta_max)
 
 
 @pytest.mark.parametrize("height", [0.8, 0.95, 1.05, 1.188])

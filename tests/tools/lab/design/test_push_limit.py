@@ -20,7 +20,7 @@ from shared.config.scenarios import Keyframe, Push, Scenario
 from shared.joints import MODULES, N_JOINTS, N_LEG
 from tools.lab.design.poses import Poses
 from tools.lab.design.push_limit import DIRECTIONS, RIGID, LoadedStand, stand_at
-from tools.lab.studies.sweeps.plants import com_height
+from tools.lab.studies.sweeps.plants import torso_at
 
 HEIGHTS = (0.7, 0.8, 0.9)
 STIFF = np.tile([900.0, 1500.0, 900.0, 1500.0, 900.0, 900.0], 2)
@@ -130,9 +130,8 @@ def test_beside_a_limp_ankle_or_knee_no_control_bears_the_hands_most_on_the_way_
     robot: RobotConfig, limp: str, down: float, moment: float, bears: float
 ) -> None:
     """Two seconds on its way there the torso is at 1.05 m, turned by 0.41 rad."""
-    at, pitch = Poses(robot), 0.41
-    stand = stand_at(robot, at, com_height(at, 1.05, pitch), pitch)
-    assert stand is not None
+    pitch = 0.41
+    stand, _ = torso_at(robot, 1.05, pitch)
     x, _, z = robot.geometry.harness_point
     arm = x * math.cos(pitch) + z * math.sin(pitch)
     wrench = (0.0, 0.0, -down, 0.0, moment + arm * down, 0.0)

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -53,7 +52,7 @@ from tools.lab.studies.sweeps.figures import (
     sole_tilt_max_rad,
     worst,
 )
-from tools.lab.studies.sweeps.study import digest_of
+from tools.lab.studies.sweeps.study import bar, digest_of
 from tools.lab.studies.sweeps.table import CaseTable, Row
 from tools.live import experiment
 from tools.live.live import run_live
@@ -447,31 +446,29 @@ def _fill(
     console: Console,
 ) -> None:
     """Run the cases that the table lacks, each written as it is done."""
-    bar = Progress(
-        BarColumn(bar_width=20), TextColumn("{task.completed}/{task.total}"),
-        TimeRemainingColumn(), TextColumn("{task.fields[case]}  {task.fields[now]}"),
-        console=console, transient=True,
-    )  # fmt: skip
     unjudged = 0
-    with bar:
-        shown = bar.add_task("", total=len(cases), case="", now="")
+    words = "{task.completed}/{task.total}  {task.fields[case]}  {task.fields[now]}"
+    with bar(words, console) as progress:
+        shown = progress.add_task("", total=len(cases), case="", now="")
 
         def see(snapshot: LiveSnapshot) -> None:
             if snapshot.truth is not None:
                 now_s, modes = max(0.0, snapshot.truth.scenario_s), "".join(snapshot.modes)
-                bar.update(shown, now=f"{now_s:4.1f} s {snapshot.truth.torso[2]:.2f} m {modes}")
+                progress.update(
+                    shown, now=f"{now_s:4.1f} s {snapshot.truth.torso[2]:.2f} m {modes}"
+                )
 
         for case in cases:
             row = row_of(case)
             if row["number"] not in table.numbers:
-                bar.update(shown, case=case.name, now="starting")
+                progress.update(shown, case=case.name, now="starting")
                 done = table.add(row, run_case(case, robot, out / case.name, see, seed=seed))
-                bar.console.print(_line_of(done), highlight=False, soft_wrap=True)
+                console.print(_line_of(done), highlight=False, soft_wrap=True)
                 unjudged = unjudged + 1 if done["verdict"] == CrashVerdict.UNJUDGED else 0
                 if unjudged == UNJUDGED_MAX:
                     reason = done["remarks"]
                     raise RunError(f"{UNJUDGED_MAX} cases in a row cannot be judged: {reason}")
-            bar.update(shown, advance=1)
+            progress.update(shown, advance=1)
 
 
 def _print_cases(cases: Sequence[CrashCase], console: Console) -> None:

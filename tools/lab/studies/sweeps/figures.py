@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -37,18 +37,6 @@ class Observer(NamedTuple):
     """Sees every row of the world, also those that do not count."""
     after_fall_s: float = 0.0
     """How long the trial continues after a fall, at which measurement ends."""
-
-    def rows_that_count(self, run: Iterable[SimTruth], from_s: float) -> Iterator[SimTruth]:
-        """Run to the end or to the fall; yield the rows from a scenario time on, and a fall."""
-        fell_at_s: float | None = None
-        for row in run:
-            self.watch(row)
-            if fell_at_s is not None:
-                if row.scenario_s > fell_at_s + self.after_fall_s:
-                    return
-            elif row.fallen or row.scenario_s >= from_s:
-                fell_at_s = row.scenario_s if row.fallen else None
-                yield row
 
 
 NOBODY: Final = Observer()
@@ -116,19 +104,33 @@ def run_fleet(
             messages.append((module, message))
         observer.record(topic, module, message)
 
-    def watch(row: SimTruth) -> None:
-        each(fleet, row)
-        observer.watch(row)
-
     scenario, plant = case.scenario(robot), case.true_plant()
     fleet = fleet_type(robot, scenario, network, seed=seed, record=record, plant=plant)
-    rows = list(observer._replace(watch=watch).rows_that_count(fleet.run(), from_s))
+    rows = list[SimTruth]()
+    for row in fleet.run():
+        each(fleet, row)
+        observer.watch(row)
+        if rows and rows[-1].fallen:
+            if row.scenario_s > rows[-1].scenario_s + observer.after_fall_s:
+                break
+        elif row.fallen or row.scenario_s >= from_s:
+            rows.append(row)
     end_ns = rows[-1].t_ns if rows else 0
     return CaseRun(
         rows,
         [row for row in fleet.events if row[1].t_ns <= end_ns],
         [row for row in messages if row[1].t_ns < end_ns],
     )
+
+
+def until_fall(run: Iterable[SimTruth]) -> list[SimTruth]:
+    """Run to the end, or to the fall: the last row then."""
+    rows = list[SimTruth]()
+    for row in run:
+        rows.append(row)
+        if row.fallen:
+            break
+    return rows
 
 
 class Ending(StrEnum):

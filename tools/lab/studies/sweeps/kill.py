@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import msgspec
 import numpy as np
+from rich.progress import track
 
 from services.simulator.physics.plant import PlantConfig
 from shared.bus.messages import JointEvent, PlannerStatus, RunEvent, RunEventKind
@@ -45,7 +46,7 @@ from tools.lab.studies.sweeps.figures import (
     sole_tilt_max_rad,
 )
 from tools.lab.studies.sweeps.plants import DIGITS, SHARE, PushFlags, PushRange, uniform
-from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun, bar
+from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live import experiment
 from tools.live.experiment import LawFlags
@@ -394,12 +395,11 @@ def robots_of(
             workers,
             lambda one: f"gain schedule with a payload of {one.mass.payload:g} kg",
         )
-        with bar("{task.completed} of {task.total} gain schedules", console) as shown:
-            line = shown.add_task("", total=len(tasks))
-            for loaded, schedule in solved:
-                made = msgspec.structs.replace(loaded, gain_schedule=schedule)
-                ready[loaded.mass.payload] = made
-                shown.update(line, advance=1)
+        for loaded, schedule in track(
+            solved, "gain schedules", total=len(tasks), console=console, transient=True
+        ):
+            made = msgspec.structs.replace(loaded, gain_schedule=schedule)
+            ready[loaded.mass.payload] = made
     return [ready[case.payload_kg] for case in cases]
 
 

@@ -29,8 +29,7 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Keyframe, Scenario
 from shared.exceptions import RunError
 from shared.joints import MODULES
-from shared.toml_file import check_ranges
-from tools.flags import Arg, Count, Number, names_of, parsed
+from tools.flags import Count, names_of, parsed
 from tools.lab.studies.sweeps import plants, study
 from tools.lab.studies.sweeps.figures import (
     EXIT_CODES,
@@ -50,7 +49,6 @@ from tools.lab.studies.sweeps.figures import (
 from tools.lab.studies.sweeps.plants import SHARE, PushRange, uniform
 from tools.lab.studies.sweeps.study import Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import DECIMALS, Row, plain
-from tools.live import experiment
 from tools.output import Picture, new_figure
 from tools.sim.centralised import CentralisedLockstep
 from tools.sim.lockstep import Lockstep
@@ -294,7 +292,7 @@ _SHARES: Final = values_up_to(1.0)
 EXAMPLES: Final = """
 xrl study latency
 xrl study latency --delay 0,50,150 --jitter 5 --loss 0,0.2 --n 10 --out out/latency
-xrl study latency --control distributed --delay 0,30,60 --loss 0 --lead-easing 0
+xrl study latency --control distributed --delay 0,30,60 --loss 0
 xrl study latency --only 137 --out out/trial137
 xrl study latency --cluster tcp://HOST:8786
 """
@@ -331,24 +329,12 @@ class LatencyStudyFlags(StudyFlags):
             + "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items()),
         ),
     ] = tuple(CONTROLS)  # fmt: skip
-    lead_easing: Annotated[Number | None, Arg(metavar="ALPHA")] = None
-    """law.lead_easing, for all controls"""
 
     def check(self) -> None:
         """Refuse a comparison of nothing."""
         super().check()
         if not self.control:
             raise RunError(f"--control: name at least one of {', '.join(CONTROLS)}")
-
-
-def load(flags: LatencyStudyFlags) -> RobotConfig:
-    """Return the robot with the easing that was asked for."""
-    robot = experiment.load_robot(flags.config)
-    if flags.lead_easing is not None:
-        law = msgspec.structs.replace(robot.law, lead_easing=flags.lead_easing)
-        robot = msgspec.structs.replace(robot, law=law)
-        check_ranges("--lead-easing", law)
-    return robot
 
 
 def grid_of(flags: LatencyStudyFlags) -> list[tuple[Network, str]]:
@@ -470,7 +456,6 @@ STUDY: Final = Study[LatencyTrial](
     name="latency",
     case="trial",
     table="latency.csv",
-    load=load,
     total=lambda flags: flags.n * len(grid_of(flags)),
     cases=lambda flags, _robot: partial(trial_of, grid_of(flags), flags.seed),
     decided_by=("delay", "jitter", "loss", "control"),

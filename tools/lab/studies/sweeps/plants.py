@@ -17,7 +17,7 @@ from shared.places import FILES
 from shared.toml_file import Range, Section, read_toml
 from tools.flags import Arg, Flags
 from tools.lab.design.poses import Poses
-from tools.lab.design.push_limit import stand_at
+from tools.lab.design.push_limit import LoadedStand, stand_at
 
 RANGES_FILE: Final = FILES / "plants" / "ranges.toml"
 LEAST_SHARE: Final = 0.5
@@ -112,14 +112,8 @@ class PushRange:
 
     def __init__(self, robot: RobotConfig, most: float = SHARE) -> None:
         """Stand the robot of a file on a level floor; `draw` goes up to `most` of the limit."""
-        poses = Poses(robot)
-        height = robot.simulation.stand_height
-        z = com_height(poses, height, 0.0)
-        stand = stand_at(robot, poses, z, 0.0)
-        if stand is None:
-            raise RunError(f"a stand with the torso at {height:g} m: this robot does not reach it")
         self._most = most
-        self._stand = stand
+        self._stand, _ = torso_at(robot, robot.simulation.stand_height, 0.0)
 
     def limit_n(self, angle: float) -> float:
         """Return the limit, N, along an angle, rad from x (forwards) to y (left)."""
@@ -163,8 +157,13 @@ def describe(flags: PushFlags) -> str:
     return f"pushed with up to {flags.push:.0%} of what soles and motors bear"
 
 
-def com_height(poses: Poses, torso: float, pitch: float) -> float:
-    """Return the COM height, m, at which the torso's origin is `torso` high, by bisection."""
+def torso_at(robot: RobotConfig, torso: float, pitch: float) -> tuple[LoadedStand, float]:
+    """Return the stand with the torso's origin at a height, m, and its COM height, by bisection.
+
+    Raises:
+        RunError: the robot does not reach it.
+    """
+    poses = Poses(robot)
     low, high = poses.reach()
     while high - low > REACHED_M:
         z = 0.5 * (low + high)
@@ -173,4 +172,8 @@ def com_height(poses: Poses, torso: float, pitch: float) -> float:
             high = z
         else:
             low = z
-    return low
+    stand = stand_at(robot, poses, low, pitch)
+    if stand is None:
+        where = f"the torso at {torso:g} m, pitch {pitch:g} rad"
+        raise RunError(f"a stand with {where}: this robot does not reach it")
+    return stand, low

@@ -20,11 +20,10 @@ from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Keyframe, Kill, Push, Scenario
 from shared.exceptions import RunError
 from tools.flags import Arg, Degrees, Duration
-from tools.lab.design.poses import Poses
-from tools.lab.design.push_limit import PushLimits, limits_along, stand_at
+from tools.lab.design.push_limit import PushLimits, limits_along
 from tools.lab.studies.sweeps import study
-from tools.lab.studies.sweeps.figures import NOBODY, Ending, Observer, ending_of
-from tools.lab.studies.sweeps.plants import com_height
+from tools.lab.studies.sweeps.figures import NOBODY, Ending, Observer, ending_of, until_fall
+from tools.lab.studies.sweeps.plants import torso_at
 from tools.lab.studies.sweeps.study import FALL_COLOUR, Study, StudyFlags, StudyRun
 from tools.lab.studies.sweeps.table import Row
 from tools.live.experiment import PlantFlags
@@ -132,12 +131,8 @@ def limits_of(trial: PushTrial, robot: RobotConfig) -> PushLimits:
     schedule = robot.gain_schedule
     if schedule is None:
         raise RunError("the robot has no gain schedule; run `xrl gains`")
-    height, pitch = POSES[trial.pose]
-    poses, scheduled = Poses(robot), ScheduledGains(schedule)
-    z = com_height(poses, height, pitch)
-    stand = stand_at(robot, poses, z, pitch)
-    if stand is None:
-        raise RunError(f"{trial.pose}: this robot does not reach it")
+    scheduled, (height, pitch) = ScheduledGains(schedule), POSES[trial.pose]
+    stand, z = torso_at(robot, height, pitch)
     angle = math.radians(trial.angle_deg)
     direction = (math.cos(angle), math.sin(angle))
     return limits_along(stand, robot, scheduled.at(z, pitch), scheduled.D_B, direction)
@@ -160,7 +155,7 @@ def _stands(trial: PushTrial, robot: RobotConfig, start: FleetMoment, force_n: f
     scenario = trial.scenario(robot, force_n)
     fleet = Lockstep(robot, msgspec.structs.replace(scenario, kill=()), BASE, plant=trial.plant)
     fleet.resume(start)
-    rows = list(NOBODY.rows_that_count(fleet.run(), -math.inf))
+    rows = until_fall(fleet.run())
     return bool(rows) and ending_of(rows[-1], scenario.duration, robot) is Ending.STOOD
 
 

@@ -1,8 +1,7 @@
-"""A study's table: one CSV row per case, appended on completion; an interrupted study resumes.
+"""A study's table: one CSV row per case, in order; an interrupted study resumes.
 
-Beside the table, `inputs.json` holds its parameters. A folder with other parameters is refused, and
-so is one that another study is writing to. A finished table is sorted by case: equal inputs give an
-equal file.
+The file is replaced whole with each row. Beside it, `inputs.json` holds its parameters. A folder
+with other parameters is refused, and so is one that another study is writing to.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import io
 import json
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -39,28 +37,25 @@ class CaseTable:
         figures: type[msgspec.Struct],
         inputs: Mapping[str, str],
     ) -> None:
-        """Open a table, new or to resume; incomplete or damaged rows are left out.
+        """Open a table, new or to resume.
 
         A row begins with what was drawn for its case, the case's number first, and ends with its
         figures. `inputs` are parameters of all rows, by name.
 
         Raises:
-            RunError: the folder cannot be used, another study is writing to it, or its parameters
-                are others or unknown.
+            RunError: the folder cannot be used, another study is writing to it, its parameters are
+                others or unknown, or the table is damaged.
         """
         folder = path.parent
         self._path, self._figures = path, figures
         self._columns = [*drawn[0], *figures.__struct_fields__]
         self._drawn = {int(str(case[self._columns[0]])): case for case in drawn}
-        self._rows: dict[int, dict[str, str]] = {}
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._inputs = (folder / INPUTS_FILE).open("a+", encoding="utf-8", errors="replace")
             try:
                 self._claim(inputs)
-                self._read()
-                self._write()
-                self._file = path.open("a", encoding="utf-8", newline="")
+                self._rows = self._read()
             except BaseException:
                 self._inputs.close()  # and no longer locked
                 raise
@@ -72,9 +67,7 @@ class CaseTable:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Sort the rows and close the file, however the study ended."""
-        self._file.close()
-        self._write()
+        """Let another study write there."""
         self._inputs.close()
 
     @property
@@ -93,8 +86,12 @@ class CaseTable:
         values = {**case, **msgspec.structs.asdict(figures)}
         row = {name: _text(value) for name, value in values.items()}
         self._rows[int(row[self._columns[0]])] = row
-        csv.DictWriter(self._file, self._columns).writerow(row)
-        self._file.flush()
+        with atomic_file(self._path, lasting=True) as raw:
+            file = io.TextIOWrapper(raw, encoding="utf-8", newline="", write_through=True)
+            writer = csv.DictWriter(file, self._columns)
+            writer.writeheader()
+            writer.writerows(known for _, known in sorted(self._rows.items()))
+            file.detach()
         return self._typed(row)
 
     def _typed(self, row: Mapping[str, str]) -> Row:
@@ -137,32 +134,20 @@ class CaseTable:
                     f"{value[:20]}); choose another --out"
                 )
 
-    def _read(self) -> None:
-        """Read the rows that are whole.
-
-        Raises:
-            RunError: the file has other columns.
-        """
+    def _read(self) -> dict[int, dict[str, str]]:
         if not self._path.exists():
-            return
-        text = self._path.read_text(encoding="utf-8", errors="replace")
-        lines = text[: text.rfind("\n") + 1].splitlines()  # a line without an end is incomplete
-        if lines and lines[0].split(",") != self._columns:
-            raise RunError(f"{self._path}: has other columns; choose another --out")
-        for line in lines[1:]:
-            with suppress(ValueError, StopIteration):  # damaged
-                row = dict(zip(self._columns, next(csv.reader([line])), strict=True))
-                self._typed(row)
-                self._rows[int(row[self._columns[0]])] = row
-
-    def _write(self) -> None:
-        """Rewrite all rows atomically."""
-        with atomic_file(self._path, lasting=True) as raw:
-            file = io.TextIOWrapper(raw, encoding="utf-8", newline="", write_through=True)
-            writer = csv.DictWriter(file, self._columns)
-            writer.writeheader()
-            writer.writerows(row for _, row in sorted(self._rows.items()))
-            file.detach()
+            return {}
+        with self._path.open(encoding="utf-8", newline="") as file:
+            table = csv.DictReader(file)
+            try:
+                if table.fieldnames != self._columns:
+                    raise RunError(f"{self._path}: has other columns; choose another --out")
+                rows = {int(row[self._columns[0]]): row for row in table}
+                for row in rows.values():
+                    self._typed(row)
+            except (ValueError, TypeError):
+                raise RunError(f"{self._path}: is damaged; choose another --out") from None
+        return rows
 
 
 def _text(value: object) -> str:

@@ -118,13 +118,12 @@ def test_another_loss_loses_other_messages_and_another_delay_the_same(robot: Rob
 
 
 def test_the_command_is_of_this_study_whatever_its_numbers_are() -> None:
-    flags = "--loss 0.1234567,0.1234568 --delay 12345.67,0.00001 --lead-easing 1e-7"
+    flags = "--loss 0.1234567,0.1234568 --delay 12345.67,0.00001"
     args = parsed(*flags.split())
     command = command_of(latency.STUDY, args)
     assert "--delay 0.00001,12345.67 --loss 0.1234567,0.1234568" in command
     again = parsed(*command.split()[3:])
     assert trials_of(again) == trials_of(args)
-    assert again.lead_easing == args.lead_easing
     assert len({(t.draw, t.repeat) for t in trials_of(args)}) == 2 * 4
     assert {row_of(t)["delay_ms"] for t in trials_of(args)} == {"0.00001", "12345.67"}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -12,11 +11,9 @@ import pytest
 
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from tests.tools.lab.studies.sweeps.tables import finished
 from tools.lab.studies.sweeps import push
 from tools.lab.studies.sweeps.plants import PushRange
-from tools.lab.studies.sweeps.push import PushResult, PushTrial, limits_of, row_of, run_trial
-from tools.output import save_figure
+from tools.lab.studies.sweeps.push import PushTrial, limits_of, run_trial
 
 
 def trials_of(**changes: Any) -> list[PushTrial]:
@@ -81,19 +78,6 @@ def test_the_push_is_in_the_direction_that_was_asked_for(robot: RobotConfig) -> 
     x, y, _ = point(angle_deg=180).scenario(robot, 40.0).push[0].force
     assert (x, y) == pytest.approx((-40.0, 0.0), abs=1e-9)
     assert point(mode="led").scenario(robot, 40.0).kill == ()
-
-
-def test_a_table_is_drawn_with_both_modes_and_the_limits(
-    robot: RobotConfig, tmp_path: Path
-) -> None:
-    trials = trials_of(pose=["stand", "crawl"])
-    outcome = PushResult(
-        stood_n=50.0, fell_n=55.0, held_limit_n=40.0, held_part="left sole's toe", body_limit_n=90.0
-    )
-    figures = msgspec.structs.asdict(outcome)
-    rows = [row_of(trial) | figures for trial in trials]
-    save_figure(push.draw(finished(rows, robot, push.PushStudyFlags())), tmp_path / "a.png")
-    assert (tmp_path / "a.png").stat().st_size > 30_000
 
 
 @pytest.fixture(scope="module")
