@@ -440,25 +440,6 @@ def is_bare_code(value: ast.expr, *, texts: bool = False) -> bool:
     return False
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "return 1",
-        "return 0 if good else 1",
-        "code = 0 if good else 1; return code",
-        "code = 2; return code",
-        "return 3 if bad else (2 if worse else 0)",
-        "return int(any(bad))",
-        "return int(not good)",
-        "sys.exit(1)",
-        "sys.exit('usage')",
-        "raise SystemExit(1 if bad else 0)",
-    ],
-)
-def test_an_exit_code_without_its_name_is_found(line: str) -> None:
-    assert bare_exit_codes(ast.parse(f"def run(args) -> int:\n    {line}")) == [2]
-
-
 def test_an_exit_code_is_given_by_its_name() -> None:
     """1 is a robot that fell, and nothing else: whoever means a fall says `FELL_EXIT_CODE`."""
     trees = {file: TREES[file] for file in in_folder("services/", "tools/")}

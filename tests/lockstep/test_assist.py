@@ -171,16 +171,6 @@ def unheeded(robot: RobotConfig) -> RobotConfig:
     return with_keys(robot, "assist", integral_max=0.0)
 
 
-def test_the_sensors_noise_reaches_the_robot_through_the_law_only() -> None:
-    deaf = unheeded(ROBOT)
-    noiseless = with_keys(deaf, "simulation", harness_noise=0.0)
-    truths = [
-        of(SimTruth, heard_in(config, still(0.5), start=standing_as(ROBOT)))
-        for config in (deaf, noiseless)
-    ]
-    assert truths[0] == truths[1]
-
-
 # ---- a sensor that lies is reported before the load is, and the assist goes
 
 FAILS_S = 3.0

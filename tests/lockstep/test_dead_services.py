@@ -11,13 +11,11 @@ from services.simulator.physics.plant import PlantConfig, changed
 from shared.bus.messages import Mode
 from shared.bus.traces import SimTruth
 from shared.config.scenarios import Kill, Push
-from shared.exceptions import RunError
 from shared.joints import MODULE_INDEX, MODULES
-from tests.lockstep.runs import kill, modes_of, push, restart, run, still, variant
+from tests.lockstep.runs import kill, modes_of, moment_of, push, restart, run, still, variant
 from tests.robots import ROBOT
 from tools.lab.studies.sweeps.figures import Ending, ending_of
-from tools.sim.centralised import torques_only
-from tools.sim.lockstep import Lockstep
+from tools.sim.lockstep import FleetMoment, Lockstep
 
 # ---- no planner: the joint services hold
 
@@ -93,8 +91,14 @@ def test_all_six_dead_in_a_squat_stand_through_pushes(
     assert np.abs(result.com_mm[result.t > at, :2]).max() < most_mm
 
 
+@pytest.fixture(scope="module")
+def squatting() -> FleetMoment:
+    """Return the moment 2 s into the squat."""
+    return moment_of(ROBOT, variant("squat", kill=(), push=()), 2.0)
+
+
 @pytest.mark.parametrize("module", ["ankle_left", "knee_right", "hip_left"])
-def test_a_dead_services_successor_leads_again(module: str) -> None:
+def test_a_dead_services_successor_leads_again(module: str, squatting: FleetMoment) -> None:
     """Taken over without a step: no module's torque jumps, and all six track in the end.
 
     The successor carries on with what its drive carries.
@@ -108,7 +112,8 @@ def test_a_dead_services_successor_leads_again(module: str) -> None:
             at = 2 * MODULE_INDEX[module]
             carried.append(fleet.bank.torque[at : at + 2].copy())
 
-    result = run(ROBOT, variant("squat", duration=5.5, push=pushes, **dies), each=look)
+    scenario = variant("squat", duration=5.5, push=pushes, **dies)
+    result = run(ROBOT, scenario, start=squatting, each=look)
     assert result.stood
     assert set(result.modes) == {Mode.TRACK}
     carries_nm = {"ankle_left": 0.5, "knee_right": 1.5, "hip_left": 0.2}  # at a motor
@@ -140,9 +145,3 @@ def test_a_service_that_comes_back_while_all_hold_is_no_stiffer_than_they_are(
     result = run(ROBOT, variant("squat", duration=5.2, **happens))
     assert ending_of(result.rows[-1], 5.2, ROBOT) is Ending.STOOD
     assert result.tilt < 0.03
-
-
-def test_a_service_without_a_process_here_or_with_torques_only_cannot_be_killed() -> None:
-    for config, service in ((ROBOT, "harness"), (torques_only(ROBOT), "knee_left")):
-        with pytest.raises(RunError, match="only the planner"):
-            Lockstep(config, variant("squat", kill=kill(1.0, service), restart=()))

@@ -23,7 +23,7 @@ from tests.planner.states import with_law
 from tests.robots import ROBOT
 from tools.lab.studies.sweeps import plants
 from tools.live.descent import LIGHT_FRACTION, Ask, Descent, DescentPhase
-from tools.sim.lockstep import Lockstep, begin_standing
+from tools.sim.lockstep import Lockstep
 
 AT_S = 0.3
 HEARD_S = 0.1
@@ -157,13 +157,6 @@ def test_with_nothing_to_bear_it_it_holds_and_says_what_helps() -> None:
     assert found.height[-1] < 0.85
     assert {*modes_of(found.lockstep)} == {Mode.DAMP}
     assert 2.3 < floor_speed(found.lockstep) < 3.5
-
-
-def test_idled_in_a_stand_it_meets_the_floor_as_hard() -> None:
-    """2.9 m/s from 1.19 m; from its lowest pose, 0.82 m, see above."""
-    fleet = Lockstep(ROBOT, alone())
-    assert begin_standing(fleet)
-    assert 2.3 < floor_speed(fleet) < 3.5
 
 
 def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one() -> None:

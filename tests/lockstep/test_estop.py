@@ -165,7 +165,7 @@ STOPPED: list[tuple[float, float, dict[str, Any] | str]] = [
 """Height, pitch, and the plant's errors or the name by which they are drawn."""
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize(("height", "pitch", "errors"), STOPPED)
 def test_without_a_holder_the_torso_stays_as_it_stood(
     heavy: RobotConfig, led_to: Callable[[float], FleetMoment], height: float, pitch: float,
@@ -186,10 +186,11 @@ def limp(module: str, at: float) -> tuple[Fault]:
     return (Fault(module=module, kind="disarmed", at=at),)
 
 
+@pytest.mark.sampled(2)
+@pytest.mark.parametrize("dead", MODULES[:3])
 @pytest.mark.parametrize(
     ("height", "at", "sank", "hand"), [(1.0, 3.6, 0.02, False), (1.188, 5.2, 0.1, True)]
 )
-@pytest.mark.parametrize("dead", MODULES[:3])
 def test_beside_a_dead_service_whose_drive_holds_the_others_hold_where_they_are(
     heavy: RobotConfig, led_to: Callable[[float], FleetMoment], dead: str, height: float,
     at: float, sank: float, hand: bool,
@@ -221,6 +222,7 @@ def pause(at: float, until: float) -> dict[str, Any]:
     return {"kill": suspended, "restart": restart(until, "knee_left")}
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("happens", "plant", "turned", "sinks"),
     [

@@ -165,6 +165,7 @@ def test_a_power_cut_of_all_buses_in_a_squat_brings_no_old_frame(lasts: float) -
     assert bool(told_s) is (lasts > 0.1)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("after_ms", [-10, -2, 0, 4])
 def test_a_power_cut_while_arming_leaves_no_request_behind(after_ms: int) -> None:
     """A limp module's service is restarted, and arms it; the cut comes about then."""

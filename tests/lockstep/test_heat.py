@@ -33,23 +33,14 @@ class Held(NamedTuple):
     derating: float
 
 
-def skip_heat(fleet: Lockstep, seconds: float = 1.0) -> None:
-    """Let time pass for the temperatures alone, true and estimated: their constants are minutes."""
-    fleet.bank.heat.skip(fleet.bank.heat.load, seconds)
-    for joint in fleet.joints:
-        state = joint.manager.state.controller.heat
-        joint.manager.controller.heat.skip(state, seconds)
-        report(state, *joint.drive.thermistors())
+def hold(robot: RobotConfig, start: FleetMoment, *, hand: bool) -> Held:
+    """Squat, let the time pass for the temperatures until 33 s are left, and run on until it rests.
 
-
-def hold(
-    robot: RobotConfig, start: FleetMoment, *, hand: bool = True, until_s: float = 16.0,
-    skip: bool = True,
-) -> Held:  # fmt: skip
-    """Squat, let the time pass for the temperatures until 33 s are left, and run on."""
-    fleet = Lockstep(robot, led_to((2.0, SQUAT), duration=until_s))
+    At most until 16 s.
+    """
+    fleet = Lockstep(robot, led_to((2.0, SQUAT), duration=16.0))
     fleet.resume(start)
-    rows, actions, derating, skips = [], [], 1.0, skip
+    rows, actions, derating, skips = [], [], 1.0, True
     for row in fleet.run():
         rows.append(row)
         if not hand and row.scenario_s > 0.5 * HELD_S:
@@ -57,9 +48,13 @@ def hold(
         if skips and row.scenario_s > HELD_S:
             skips = False
             while min(law.heat.left_s for law in fleet.controllers) > 33.0:
-                skip_heat(fleet)
-        actions.append(status_of(fleet).heat)
+                fleet.skip_heat(1.0)
+        status = status_of(fleet)
+        actions.append(status.heat)
         derating = min(derating, fleet.bank.heat.derating)
+        rests = status.heat == HeatAction.RESTS and status.heat_left_s > 60.0
+        if rests and row.torso[2] > 1.2:
+            break
     return Held(fleet, rows, actions, derating)
 
 
@@ -80,14 +75,6 @@ def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
     assert status.heat_left_s > 60.0
     assert max(abs(1e3 * row.com[0]) for row in held.rows) < 15.0
     assert max(law.heat.winding[0] for law in held.fleet.controllers) < 100.0
-
-
-def test_without_an_estimate_nothing_is_said_and_nothing_done(robot: RobotConfig) -> None:
-    heat = msgspec.structs.replace(robot.heat, estimate=False)
-    deaf = msgspec.structs.replace(robot, heat=heat)
-    held = hold(deaf, standing_as(deaf), skip=False, until_s=1.0)
-    assert set(held.actions) == {HeatAction.NONE}
-    assert status_of(held.fleet).heat_left_s == -1.0
 
 
 @pytest.mark.parametrize(

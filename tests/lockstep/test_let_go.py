@@ -88,12 +88,6 @@ def test_a_pitched_torso_stays_whatever_the_person_rests_on_it(
     assert turned(let_go(errors, 1.05, 0.7, 60.0, duration=6.0)) < 0.15
 
 
-def test_with_nothing_amiss_it_is_led_on_and_stays_too() -> None:
-    outcome = let_go({}, 1.1, duration=6.0)
-    assert np.ptp(outcome.height) < 0.01
-    assert outcome.status.mode == PlannerMode.LEADING
-
-
 @pytest.mark.parametrize(
     ("errors", "words"),
     [

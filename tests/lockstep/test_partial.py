@@ -29,7 +29,6 @@ from shared.joints import MODULE_INDEX, MODULES, SIDES
 from shared.links import Pair as Link
 from tests.lockstep.runs import Heard, led_to, modes_of, moment_of, push, restart, run
 from tests.robots import ROBOT
-from tests.shared.mcap_log.runs import sample as sample_of
 from tools.lab.studies.sweeps.figures import Ending, com_max_mm, ending_of, operator_peak_n, step_nm
 from tools.sim.lockstep import FleetMoment, Lockstep
 
@@ -159,16 +158,3 @@ def test_with_any_subset_failed_all_hold_at_once_nothing_falls_and_all_six_lead_
     assert fleet.torque_step_nm <= 5.0
     assert com_max_mm(rows) < 110.0, "90 measured with a leg frozen, of 127 to the sole's end"
     assert operator_n < 75.0, "44 to 50 measured: it leads, and is not at its limit"
-
-
-def test_who_tips_at_the_end_or_does_not_come_so_far_has_not_stood() -> None:
-    good = {"scenario_s": END_S, "com": (0.0, 0.0, 1.0), "fallen": False}
-    good |= {"foot_left_tilt": 0.0, "foot_right_tilt": 0.0, "lean": (0.0, 0.0)}
-    for changes, ending in (
-        ({}, Ending.STOOD),
-        ({"fallen": True}, Ending.FELL),
-        ({"foot_left_tilt": 0.06}, Ending.TIPPING),
-        ({"com": (0.13, 0.0, 1.0)}, Ending.TIPPING),
-        ({"scenario_s": END_S - 0.5}, Ending.FELL),
-    ):
-        assert ending_of(sample_of(SimTruth, **(good | changes)), END_S, ROBOT) is ending

@@ -86,11 +86,6 @@ def led(
     return outcome
 
 
-def test_while_the_hand_leads_into_the_crawl(judged: Judged) -> None:
-    pushes = (push(1.0, 0.0, 40.0, 0.0), push(2.0, 40.0, 0.0, 0.0))
-    led(judged, variant("crawl", duration=3.5, kill=(), push=pushes))
-
-
 def test_while_a_strong_hand_leads_up_within_a_second(judged: Judged) -> None:
     low = 1.188 - 0.45
     outcome = led(judged, led_to((2.5, low), (3.0, low), (3.7, 1.188), duration=5.0))

@@ -14,7 +14,6 @@ from services.simulator.physics.operator import HEIGHT_MAX_RATE
 from shared.bus import topics
 from shared.bus.messages import HandLead, Mode, PlannerStatus
 from shared.bus.traces import SimTruth
-from shared.clock import NS_PER_S
 from shared.config.impairment import Impairment
 from shared.config.scenarios import Fault, Scenario
 from shared.joints import MODULES
@@ -100,17 +99,6 @@ def test_a_lean_that_was_asked_for_is_no_excursion_and_comes_out_again(tmp_path:
     asked = max(status.shift_requested[1] for status in statuses_of(tmp_path))
     assert asked == pytest.approx(0.04, abs=1e-4)
     assert cli.main(["log", "resim", str(tmp_path), "--service", "planner"]) == 0
-
-
-def test_a_stance_that_is_not_led_is_reported_in_words(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lockstep, "READY_NS", 5 * NS_PER_S)
-    far = ("--plant", "feet.offset_right=[0.2,0,0]")
-    assert sim(tmp_path, "--duration", "1", *far) == 2
-    output = capsys.readouterr().err
-    assert "the planner did not lead" in output
-    assert "ahead of the left" in output
 
 
 # ---- two robots in one process

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from shared.bus.messages import Cause, Mode
-from tests.lockstep.runs import Run, kill, push, run, still, variant
-from tests.planner.states import with_law
+from tests.lockstep.runs import Run, kill, push, run, variant
 from tests.robots import ROBOT
-from tools.sim.lockstep import Lockstep
 
 DIES_S = 8.0
 
@@ -74,17 +72,6 @@ def test_the_feet_stay_flat_and_where_they_are_however_often_it_squats(squat: Ru
 def test_the_robot_stands_whenever_the_planner_dies(at: float) -> None:
     pushes = (push(at + 0.5, 40, 0, 0), push(at + 1.5, 0, -40, 0))
     assert run(ROBOT, variant("squat", duration=at + 3.0, kill=kill(at), push=pushes)).stood
-
-
-def test_a_plain_average_of_the_legs_tips_the_soles() -> None:
-    averaging = with_law(ROBOT, jacobian="average", split="diagonal")
-    world = Lockstep(averaging, still(5.0))
-    tilt = 0.0
-    for _ in range(1200):
-        world.advance()
-        truth = world.world.truth(0, 1.0, 0.0)
-        tilt = max(tilt, truth.foot_left_tilt, truth.foot_right_tilt)
-    assert tilt > 0.02, "with load sharing 0.0005"
 
 
 @pytest.mark.sampled(2)

@@ -189,7 +189,8 @@ def test_on_a_plant_of_many_errors_nothing_trips_without_a_reason(
 ) -> None:
     statuses = Heard(PlannerStatus)
     plant = changed(PlantConfig(), SMALL_ERRORS)
-    outcome = run(robot, variant(name), plant=plant, record=statuses)
+    scenario = variant(name, duration=8.0, kill=(), push=())
+    outcome = run(robot, scenario, plant=plant, record=statuses)
     assert outcome.stood
     assert not causes(outcome) & set(JOINT_TRIPS)
     assert {row.trip for row in statuses} == {Trip.NONE}
@@ -216,6 +217,7 @@ def test_a_torso_that_is_thrown_about_is_held(robot: RobotConfig) -> None:
     assert not causes(outcome) & set(JOINT_TRIPS)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("height", "pitch", "ways_s"),
     [(0.85, 0.0, 1.5), (1.29, 0.0, 1.5), (0.79, 1.2, 2.0), (0.7, 0.0, 3.0)],
@@ -233,7 +235,7 @@ def lean(newtons: float, at: float = 2.8) -> Push:
     return Push(at=at, duration=3.0, force=(0.0, newtons, 0.0))
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("delay_ms", [1.0, 10.0])
 @pytest.mark.parametrize(
     ("height", "pitch", "newtons"),
@@ -257,6 +259,7 @@ def lean_slowly(newtons: float) -> tuple[Push, ...]:
     return tuple(Push(at=at, duration=9.5 - at, force=(0.0, newtons / 20, 0.0)) for at in starts)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(("height", "newtons"), [(1.188, 55.0), (1.188, -50.0), (0.95, 55.0)])
 def test_leaned_on_slowly_it_is_led_on_and_comes_back_and_killed_then_it_stands(
     robot: RobotConfig, height: float, newtons: float

@@ -131,7 +131,7 @@ def squats(seconds: float) -> tuple[Keyframe, ...]:
     ("ordered", "seconds", "tracked"),
     [
         pytest.param(True, 60.0, 0.06, id="a minute of a stream", marks=pytest.mark.wide),
-        pytest.param(True, 15.0, 0.06, id="a stream"),
+        pytest.param(True, 10.0, 0.06, id="a stream"),
         pytest.param(False, 8.0, 0.9, id="datagrams"),
     ],
 )

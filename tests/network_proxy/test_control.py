@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.network_proxy.control import ASKERS_MAX, CommandHandler, ControlSocket
+from services.network_proxy.control import CommandHandler, ControlSocket
 from services.network_proxy.sockets import SocketWatch
 from shared.config.scenarios import Inject
 from shared.exceptions import FleetError
@@ -140,52 +140,3 @@ def test_garbage_and_half_requests_are_answered_or_dropped_and_the_next_is_serve
             asking.shutdown(socket.SHUT_WR)
             assert asking.recv(1) == b""
     assert ProxyClient(served[1]).list() == ()
-
-
-LONG = Reply(error="x" * 1_000_000)
-"""More than a socket takes at once."""
-
-
-class Served:
-    """A control socket whose answers are long, turn by turn."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.watch = folder, SocketWatch()
-        self.path = make_live_dir(folder) / SOCKET
-        self.control = ControlSocket(self.path, lambda _: LONG, self.watch)
-
-    def turn(self) -> None:
-        while ready := self.watch.wait(0.002):
-            for call, events in ready:
-                call(events, 0)
-
-    def ask(self, text: bytes = b"") -> socket.socket:
-        asking = dialled(self.folder)
-        asking.sendall(text)
-        asking.setblocking(False)
-        self.turn()
-        return asking
-
-
-def test_a_client_that_reads_late_never_or_asks_nothing_keeps_no_other_out(tmp_path: Path) -> None:
-    served, got = Served(tmp_path), b""
-    with served.ask(2 * b'{"type":"list"}\n') as asking:
-        with served.ask(b'{"type":"list"}\n') as other:
-            assert other.recv(100), "nobody waits for it"
-        while got.count(b"\n") < 2:
-            got += asking.recv(1 << 20)
-            served.turn()
-    assert [msgspec.json.decode(line, type=Reply) for line in got.splitlines()] == [LONG, LONG]
-    served.control.close()
-    served = Served(tmp_path)
-    with served.ask(1000 * b'{"type":"list"}\n'):
-        assert len(served.control._askers[0].answer) <= len(msgspec.json.encode(LONG)) + 1
-        served.control.close()
-    served = Served(tmp_path)
-    idle = [served.ask() for _ in range(2 * ASKERS_MAX)]
-    assert len(served.control._askers) == ASKERS_MAX
-    with served.ask(b'{"type":"list"}\n') as asking:
-        assert asking.recv(100)
-    served.control.close()
-    for end in idle:
-        end.close()

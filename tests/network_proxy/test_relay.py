@@ -9,7 +9,6 @@ from operator import itemgetter
 import pytest
 
 from services.network_proxy.connection import PENDING_MAX, WAITING_MAX
-from services.network_proxy.relay import LINKS_MAX
 from shared.config.impairment import Direction, Impairment
 from tests.network_proxy.rig import (
     DECLARE,
@@ -117,18 +116,6 @@ def test_what_a_partition_held_comes_in_order_and_after_the_delay_in_force(rig: 
     assert came == [[], [1], [], [2, 3]]
 
 
-def test_on_a_stream_a_message_stays_behind_a_declaration_and_one_behind_it(rig: Rig) -> None:
-    planner, knee = rig.link()
-    rig.there.begin(1, Impairment(delay_ms=20.0, jitter_ms=20.0, ordered=True))
-    sent = b"".join(batch(DECLARE if n % 3 else MESSAGE, n) for n in range(60))
-    planner.send(sent)
-    rig.turn()
-    rig.there.end(1)
-    rig.say(planner, 60)
-    rig.at(50.0)
-    assert heard(knee) == sent + batch(MESSAGE, 60)
-
-
 def test_what_a_partition_held_is_not_overtaken_by_datagrams_after_it(rig: Rig) -> None:
     planner, knee = rig.link()
     rig.there.begin(1, Impairment(delay_ms=30.0, reorder=1.0))
@@ -167,7 +154,6 @@ def test_a_sender_is_stopped_when_too_much_is_on_its_way(rig: Rig) -> None:
     assert rig.rest_of(planner, knee, rest, sent) == sent // len(body) * body
 
 
-CUT = Impairment(partition=True)
 CUT_STREAM = Impairment(partition=True, ordered=True)
 
 
@@ -200,45 +186,6 @@ def test_a_link_whose_other_end_is_gone_ends_and_a_new_dial_links_again(rig: Rig
     rig.say(planner, 7)
     assert heard(knee) == batch(MESSAGE, 7)
     assert rig.relay.links == 1
-
-
-def test_the_last_messages_of_a_sender_that_left_reach_a_slow_receiver(rig: Rig) -> None:
-    planner, knee = rig.link()
-    sent = 75 * batch(MESSAGE + bytes(4000))  # more than the kernel keeps for one socket
-    assert rig.push(planner, sent) == b""
-    planner.close()
-    rig.turn()
-    got = b""
-    while (more := heard(knee)) != b"":
-        got += more or b""
-        rig.turn()
-    assert got == sent
-    assert rig.relay.links == 0
-
-
-def test_a_death_behind_a_partition_is_not_seen_by_a_connected_peer(rig: Rig) -> None:
-    planner, knee = rig.link()
-    rig.there.begin(1, CUT)
-    planner.close()
-    rig.turn()
-    for ms in range(1, 20):
-        rig.now_ns = ms * 1_000_000
-        rig.say(knee, ms)
-    assert heard(knee) is None, "neither a message nor the end"
-    rig.there.end(1)
-    rig.release()
-    assert heard(knee) == b""
-
-
-def test_dials_in_a_partition_to_one_who_is_frozen_are_kept_up_to_a_bound(rig: Rig) -> None:
-    rig.there.begin(1, CUT)
-    rig.back.begin(1, CUT)
-    lasting = rig.dial()
-    for _ in range(50):
-        rig.dial().close()
-        rig.turn()
-        assert rig.relay.links <= LINKS_MAX
-    assert heard(lasting) is None, "the first that is given up is one that was left already"
 
 
 def test_an_end_that_takes_nothing_for_a_lease_is_parted_and_the_other_sees_it(rig: Rig) -> None:
@@ -286,18 +233,6 @@ def test_what_a_link_takes_with_it_is_lost_and_has_not_passed(rig: Rig) -> None:
         end.close()
         rig.turn()
     assert rig.ended() == (0, 100)
-
-
-def test_a_late_message_without_a_receiver_is_lost_once_though_it_was_doubled(rig: Rig) -> None:
-    planner, knee = rig.link()
-    rig.there.begin(1, Impairment(delay_ms=50.0, duplicate=1.0))
-    rig.say(planner, 1, 2, 3)
-    rig.at(50.0)
-    assert heard(knee) == b"".join(2 * batch(MESSAGE, number) for number in (1, 2, 3))
-    rig.say(planner, 4, 5)
-    knee.close()
-    rig.turn()
-    assert rig.ended() == (3, 2)
 
 
 def test_clearing_with_all_queues_full_lets_everything_through(rig: Rig) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from services.planner.law.kinematics import Kinematics, Measured
+from services.planner.law.kinematics import Kinematics
 from services.planner.law.model import load_pinocchio, q_tree
 from shared.bus.messages import Vector6
 from shared.config.robot_config import RobotConfig
@@ -110,13 +110,3 @@ def check_torso(robot: RobotConfig, q: list[float], stance: tuple[float, ...]) -
     wanted = frames.torso_rotation((roll, pitch, yaw))
     assert abs(np.dot(rotation, wanted)) == pytest.approx(1.0, abs=1e-12 + apart**2)
     return apart
-
-
-def test_with_legs_that_agree_it_is_there_to_rounding_whatever_the_stance(
-    robot: RobotConfig,
-) -> None:
-    """The stance in which the legs agree at drawn angles is found by the planner's own graph."""
-    q = [angle + 0.02 * (-1) ** i for i, angle in enumerate(stand_pose(robot, 1.0))]
-    stance = tuple(Measured(robot).stance_at(np.array(q)).tolist())
-    assert max(map(abs, stance)) > 1e-3
-    assert check_torso(robot, q, stance) < 1e-9

@@ -149,27 +149,6 @@ def test_no_real_time_is_taken_that_the_kernel_would_kill_for(
     assert bool(taken) == may
 
 
-@pytest.mark.parametrize(
-    ("period", "runtime", "pause_ms"),
-    [
-        ("1000000", "950000", 50.0),
-        ("100000", "95000", 5.0),
-        ("1000000", "-1", 0.0),
-        ("1000000", "1000000", 0.0),
-        ("1000000", "?", 0.0),
-    ],
-)
-def test_how_long_the_kernel_stops_what_fills_a_processor_is_read(
-    tmp_path: Path, period: str, runtime: str, pause_ms: float
-) -> None:
-    assert scheduling.real_time_pause_ms(tmp_path) == 0.0
-    kernel = tmp_path / "proc/sys/kernel"
-    kernel.mkdir(parents=True)
-    (kernel / "sched_rt_period_us").write_text(period + "\n", encoding="ascii")
-    (kernel / "sched_rt_runtime_us").write_text(runtime + "\n", encoding="ascii")
-    assert scheduling.real_time_pause_ms(tmp_path) == pause_ms
-
-
 pytestmark = [pytest.mark.system]
 
 PLANNER = """

@@ -92,26 +92,6 @@ def test_the_full_sequence_takes_its_time_turns_the_shaft_out_and_back_and_finds
     assert rotor.bank.state[2] == AxisState.CLOSED_LOOP_CONTROL
 
 
-@pytest.mark.parametrize(
-    ("motor", "direction", "fault"),
-    [
-        (False, 1, AxisErrors(AxisError.INVALID_STATE)),
-        (True, 0, AxisErrors(AxisError.INVALID_STATE)),
-        (True, 1, AxisErrors(AxisError.MOTOR_FAILED, motor=MotorError.UNKNOWN_PHASE_ESTIMATE)),
-    ],
-)
-def test_closed_loop_says_what_is_not_calibrated(
-    motor: bool, direction: int, fault: AxisErrors
-) -> None:
-    rotor = Rotor(encoder__direction=direction)
-    rotor.bank.calibration.motor[2] = motor
-    rotor.ask(AxisState.CLOSED_LOOP_CONTROL)
-    rotor.run(2 * DT)
-    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, fault)
-    moved = rotor.bank.input_pos[2] != 0.0
-    assert moved == bool(fault.motor), "it armed for a cycle, from where it is"
-
-
 def test_an_encoder_calibrates_after_its_motor_and_forgets_its_turns_as_it_begins() -> None:
     rotor = Rotor()
     rotor.ask(ENCODER)
@@ -165,55 +145,3 @@ def test_a_calibration_that_fails_says_why_stops_there_and_leaves_the_axis_uncal
     assert math.isnan(rotor.found("motor.config.phase_resistance")) == (fault == RESISTANCE)
     rotor.run(0.5)
     assert rotor.bank.torque[2] == 0.0
-
-
-LOST_INDUCTANCE = AxisErrors(motor=MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE)
-
-
-@pytest.mark.parametrize(
-    ("state", "after_s", "fault", "motor", "encoder"),
-    [
-        (MOTOR, 0.05, LOST_INDUCTANCE, False, False),
-        (MOTOR, 3.5, AxisErrors(), True, False),
-        (FULL, 0.5, AxisErrors(), True, False),
-        (FULL, 3.0, MISMATCH, True, False),
-        (FULL, 7.0, AxisErrors(), True, True),
-    ],
-    ids=["resistance", "inductance", "lock", "way out", "way back"],
-)
-def test_what_a_request_for_idle_leaves_behind_is_half_a_measurement(
-    state: AxisState, after_s: float, fault: AxisErrors, motor: bool, encoder: bool
-) -> None:
-    """Twice it even counts as calibrated: whoever stops one has to restart the board."""
-    rotor = Rotor()
-    rotor.ask(state)
-    if state == FULL:
-        rotor.pass_motor()
-    rotor.run(after_s)
-    rotor.ask(AxisState.IDLE)
-    rotor.run(DT)
-    assert (rotor.bank.state[2], rotor.bank.faults[2]) == (AxisState.IDLE, fault)
-    assert rotor.calibrated == (motor, encoder)
-    assert rotor.bank.torque[2] == 0.0
-    if fault == LOST_INDUCTANCE:
-        assert 0.0 < rotor.found("motor.config.phase_resistance") < 0.5 * PHASE_RESISTANCE
-    rotor.bank.reboot(2)
-    assert rotor.calibrated == (False, False)
-    assert rotor.found("motor.config.phase_resistance") == PHASE_RESISTANCE, "as it was saved"
-
-
-def test_a_calibration_ignores_the_input_torque_and_ends_with_an_unfed_watchdog() -> None:
-    rotor = Rotor()
-    rotor.bank.input_torque[2] = 1.0
-    rotor.ask(MOTOR)
-    rotor.run(MOTOR_S - 0.5)
-    assert rotor.bank.torque[2] == pytest.approx(0.0, abs=1e-6)
-    # Native (USB) writes do not feed it.
-    rotor = Rotor()
-    rotor.ask(MOTOR)
-    rotor.run(1.0)
-    rotor.bank.settings.set(1, "axis0.config.watchdog_timeout", 0.1)
-    rotor.bank.settings.set(1, "axis0.config.enable_watchdog", value=True)
-    rotor.run(0.12)
-    assert rotor.bank.faults[2] == AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED)
-    assert (rotor.bank.state[2], rotor.calibrated) == (AxisState.IDLE, (False, False))

@@ -135,23 +135,6 @@ def test_a_starved_watchdog_floats_its_axis_alone_and_counts_only_while_it_is_on
     assert paused.state[0] == IDLE
 
 
-def test_a_watchdog_enabled_before_it_was_fed_expires_at_once_whatever_its_timeout() -> None:
-    bank = idle_bank(watchdog=False)
-    bank.settings.fill("config.watchdog_timeout", 0.0)
-    bank.settings.save(1)
-    bank.reboot(2)
-    step_for(bank, 1.6)
-    bank.settings.set(1, "axis0.config.enable_watchdog", value=True)
-    for axis in ("axis0", "axis1"):
-        bank.settings.set(1, f"{axis}.config.watchdog_timeout", 5.0)
-    bank.feed(3)
-    bank.settings.set(1, "axis1.config.enable_watchdog", value=True)
-    step_for(bank, 2 * DT)
-    assert bank.heartbeat(2).axis_error == AxisError.WATCHDOG_TIMER_EXPIRED
-    step_for(bank, 1.0)
-    assert bank.heartbeat(3).axis_error == 0
-
-
 @pytest.mark.parametrize("fault", sorted(FAULTS))
 def test_an_injected_fault_floats_its_axis_alone_but_where_gate_drivers_share_it(
     fault: str,
@@ -189,19 +172,6 @@ def test_a_current_limit_lowered_under_load_disarms_beyond_8_a(
     step_for(bank, DT)
     assert (bank.state[3], bank.state[2]) == (IDLE if disarms else CLOSED_LOOP, CLOSED_LOOP)
     assert bank.faults[3] == (FAULTS["CURRENT_LIMIT"] if disarms else AxisErrors())
-
-
-@pytest.mark.parametrize(
-    ("amperes", "speed", "disarms"),
-    [(-40.0, 2.0, False), (-40.0, 8.0, True), (0.0, 2.0, False), (0.0, 8.0, False)],
-)
-def test_a_bump_under_load_disarms_where_the_emf_drives_the_current_beyond_its_limit(
-    amperes: float, speed: float, disarms: bool
-) -> None:
-    """Thrown to a speed within a step at full current; without a load neither does."""
-    bank = heavy_bank(amperes * KT)
-    step_for(bank, 0.005, vel=only(4, speed))
-    assert (bank.faults[4] == FAULTS["CURRENT_LIMIT"]) == disarms
 
 
 # ---- encoders and restarts
@@ -319,22 +289,6 @@ def test_a_motors_thermistor_counts_once_it_is_enabled(enabled: bool) -> None:
         shares[celsius] = bank.heat._control.derating[5]
     assert shares[110.0] == pytest.approx(0.5 if enabled else 1.0, abs=0.1)
     assert (bank.faults[5].motor == MotorError.MOTOR_THERMISTOR_OVER_TEMP) is enabled
-
-
-def test_temperatures_end_where_loss_and_resistances_say_however_time_passes() -> None:
-    heat, bank, square = Heat(), make_bank(), np.full(12, (20.0 * KT) ** 2)
-    bank.heat.skip(square, 36_000.0)
-    winding = float(bank.heat.winding[0])
-    loss = 1.5 * heat.resistance * (1.0 + 0.00393 * (winding - 25.0)) * 400.0
-    rise = heat.winding_to_housing + heat.housing_to_air
-    assert winding == pytest.approx(heat.ambient + rise * loss, abs=0.1)
-    assert bank.heat.housing[0] == pytest.approx(heat.ambient + heat.housing_to_air * loss, abs=0.1)
-    assert bank.heat.fet[0] == pytest.approx(25.0 + 0.054 * 400.0, abs=0.01)
-    stepped, skipped = loaded_bank(), loaded_bank()
-    stepped.current_lim[:] = skipped.current_lim[:] = 20.0
-    step_for(stepped, 20.0)
-    skipped.heat.skip(square, 20.0)
-    assert stepped.heat.numbers() == pytest.approx(skipped.heat.numbers(), abs=0.2)
 
 
 # ---- the supply

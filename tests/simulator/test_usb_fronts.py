@@ -194,21 +194,6 @@ def test_a_state_and_a_mode_go_to_the_axis_and_one_that_does_not_exist_is_an_err
     assert client.exchange("axis0.controller.config.input_mode") == 1
 
 
-def test_the_configuration_is_saved_in_idle_only_and_a_restart_forgets_what_was_not(
-    client: Client, bank: AxisBank
-) -> None:
-    client.exchange("axis0.requested_state", AxisState.CLOSED_LOOP_CONTROL)
-    client.call("save_configuration")
-    assert bank.is_responding(2 * MODULE)
-    client.exchange("axis0.requested_state", AxisState.IDLE)
-    client.exchange("axis0.controller.config.vel_limit", 7.0)
-    client.call("save_configuration")
-    assert not bank.is_responding(2 * MODULE), "it restarts"
-    client.exchange("axis0.controller.config.vel_limit", 9.0)
-    client.call("reboot")
-    assert bank.settings.get(MODULE, "axis0.controller.config.vel_limit") == 7.0
-
-
 VERSION = struct.pack("<HHHIH", 0x81, 0x8000, 4, 0xFFFF_FFFF, 1)
 """Asks for the id of the descriptor."""
 

@@ -166,18 +166,6 @@ def _momentum(world: World) -> Array:
     return np.asarray(74.58 * (world.data.subtree_com[0] - before) / 0.002, float)
 
 
-def test_the_hand_waits_for_the_hoist_and_keeps_within_its_strength(robot: RobotConfig) -> None:
-    world = world_of(robot, hand=True, keyframe=(Keyframe(at=0.0, height=2.0, pitch=1.5),))
-    run(world, 0.01)
-    assert world.outside.hand == (0.0, 0.0)
-    world.remove_hoist()
-    hand, strongest = robot.simulation.operator, [0.0, 0.0]
-    for _ in range(500):
-        world.step(IDLE)
-        strongest = [max(s, abs(f)) for s, f in zip(strongest, world.outside.hand, strict=True)]
-    assert strongest == [hand.force_max, hand.moment_max]
-
-
 @pytest.mark.parametrize("pitch", [0.0, 0.6, 1.2])
 def test_the_harness_feels_hand_and_load_in_torso_axes(robot: RobotConfig, pitch: float) -> None:
     """Hand up, load down, along world z; turned into the torso, the hand's moment about its y."""
@@ -226,26 +214,3 @@ def test_what_the_harness_feels_is_what_acts_on_the_torso_wherever_the_payload_i
     assert np.abs(force[1:]).min() > 10.0
     assert seen(world).operator_force[1] == pytest.approx(force[1])
     np.testing.assert_allclose(world.data.xfrc_applied[torso], [*force, *moment], atol=1e-9)
-
-
-@pytest.mark.parametrize(("at", "rolls"), [(-0.02, 0.0), (-0.01, 0.5)])
-def test_sideways_the_hand_pulls_the_harness_point_to_where_it_holds_it_against_its_rate(
-    robot: RobotConfig, at: float, rolls: float
-) -> None:
-    """Turned, so that a torso that rolls moves the point, which lies ahead of it, sideways."""
-    lead = Keyframe(at=0.0, height=1.25, pitch=1.2, side=0.03)
-    world = world_of(robot, hand=True, keyframe=(lead,))
-    world.remove_hoist()
-    world.data.qpos[1] = at
-    world.data.qpos[3:7] = (math.cos(0.6), 0.0, math.sin(0.6), 0.0)
-    world.data.qvel[:6] = (0.0, 0.1, 0.0, rolls, 0.0, 0.0)
-    run(world, 0.002)
-    torso = world.data.body("torso")
-    R, rates = torso.xmat.reshape(3, 3).copy(), world.data.qvel[:6].copy()
-    arm = R @ np.array(robot.geometry.harness_point)
-    y, rate = torso.xpos[1] + arm[1], rates[1] + np.cross(R @ rates[3:], arm)[1]
-    world.step(IDLE)
-    hand = robot.simulation.operator
-    wanted = hand.k_y * (0.03 - y) - hand.b_y * rate
-    assert seen(world).operator_force[1] == pytest.approx(wanted, abs=1.0)
-    assert abs(wanted) > 5.0

@@ -102,21 +102,6 @@ def test_what_runs_beside_live_fleets_gives_way_to_them(root: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("in_the_way", [False, True], ids=["it fails", "no place for libraries"])
-def test_graphs_that_cannot_be_translated_cost_speed_only(root: Path, in_the_way: bool) -> None:
-    body = "echo python called: $*"
-    if in_the_way:
-        (root / ".venv/xrl-graphs").write_text("")
-    else:
-        body += "; [[ $* != *graph_libraries* ]]"
-    write_tool(root, "python", body)
-    code, said = run(root)
-    assert code == 0
-    assert "the law's graphs stay interpreted" in said
-    again = run(root)[1]
-    assert "-m tools.graph_libraries" in again, "it is tried again"
-
-
 @pytest.mark.parametrize("status", [1, 2], ids=["a failure", "a file that cannot be imported"])
 def test_failures_are_listed_last_and_the_other_parts_are_run(root: Path, status: int) -> None:
     write_tool(root, "mypy", "exit 1")
@@ -147,27 +132,7 @@ def test_the_last_line_says_what_ran_and_what_was_skipped_and_why(root: Path) ->
     assert last.endswith("; skipped: nothing")
 
 
-def test_who_reads_no_further_ends_it(root: Path) -> None:
-    write_tool(root, "mypy", "sleep 0.5; yes | head -n 100000")
-    script = start(root)
-    assert script.stdout is not None
-    while "== mypy" not in script.stdout.readline():
-        assert script.poll() is None
-    script.stdout.close()
-    assert script.wait(timeout=30) == 128 + signal.SIGPIPE
-
-
-def test_its_help_names_the_parts_and_runs_none(root: Path) -> None:
-    script = subprocess.run(
-        ["bash", "deploy/test", "--help"], cwd=root, capture_output=True, text=True, check=True
-    )
-    assert "Parts: ruff check, ruff format, mypy; live fleets" in script.stdout
-    assert "Exits with 0 if every part passed" in script.stdout
-    assert "called" not in script.stdout
-
-
-@pytest.mark.parametrize("background", [False, True])
-@pytest.mark.parametrize("part", ["mypy", "pytest"])
+@pytest.mark.parametrize(("part", "background"), [("mypy", False), ("pytest", True)])
 def test_ctrl_c_ends_all_of_it(root: Path, part: str, *, background: bool) -> None:
     """Whatever the part that it meets makes of it: pytest ends with 2, and not by the signal."""
     write_tool(root, part, f"trap 'kill $!; exit 2' INT\nsleep 30 &\necho {part} begins\nwait")
