@@ -173,12 +173,9 @@ class Recorder:
                 self._logger.error("%s", self.trouble)
             case DiskChange.BACK:
                 self.trouble = ""
-                if self._snapshot is None and not self._why_next:
-                    self._begin(now_ns, {"why": "space again"})
-                self._logger.warning(
-                    "%s: %d MiB free: recording goes on; %d messages were left out",
-                    where, free // MIB, self._writer.left_out,
-                )  # fmt: skip
+                self._logger.warning("%s: %d MiB free again", where, free // MIB)
+                if self._snapshot is None:
+                    self._why_next = self._why_next or "space again"
             case DiskChange.NONE:
                 pass
 

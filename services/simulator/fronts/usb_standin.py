@@ -102,17 +102,13 @@ def _compile(library: Path) -> None:
             command, capture_output=True, text=True, timeout=_COMPILE_S, check=False
         )
     except FileNotFoundError:
-        raise FleetError(
-            f"emulated USB: no C compiler `{_COMPILER}` is on PATH; install one "
-            '(Debian, Ubuntu: apt install gcc libc6-dev), or use driver = "odrive_can"'
-        ) from None
+        wrong = "is not on PATH; install one (Debian, Ubuntu: apt install gcc libc6-dev)"
     except subprocess.TimeoutExpired:
-        raise FleetError(
-            f"emulated USB: the C compiler `{_COMPILER}` was not done with {SOURCE.name} in "
-            f"{_COMPILE_S:g} s"
-        ) from None
-    if result.returncode:
-        raise FleetError(
-            f"emulated USB: the C compiler `{_COMPILER}` failed on {SOURCE}; a working one for C11 "
-            f"with the C library's headers is wanted:\n{result.stderr.strip()}"
-        )
+        wrong = f"was not done with {SOURCE.name} in {_COMPILE_S:g} s"
+    else:
+        if not result.returncode:
+            return
+        wrong = f"failed on {SOURCE}; C11 with the C library's headers is wanted:\n{result.stderr}"
+    raise FleetError(
+        f'emulated USB: the C compiler `{_COMPILER}` {wrong.strip()}, or use driver = "odrive_can"'
+    )
