@@ -59,7 +59,7 @@ class Recorder:
         self._reported_unwritable = False
         self.trouble = ""
         """Why nothing is recorded now, in words; "" if it is."""
-        self._watch_space(now_ns)
+        self._watch_space()
         if snapshot is None:
             self._begin(now_ns, {})
 
@@ -72,7 +72,7 @@ class Recorder:
         flush = self._flush.passed(now_ns)
         if self._sync.passed(now_ns):  # flushes as well
             self._writer.sync()
-            self._watch_space(now_ns)
+            self._watch_space()
         elif flush:
             self._writer.flush()
         if flush:
@@ -151,7 +151,7 @@ class Recorder:
         if self._snapshot is None:
             self._why_next = f"the file before was {place.value}"
 
-    def _watch_space(self, now_ns: int) -> None:
+    def _watch_space(self) -> None:
         """Stop before the disk is full, and go on when it no longer is."""
         try:
             free = self._free_bytes()

@@ -7,6 +7,7 @@ are written; another fault extends that. Memory is bounded: the oldest messages 
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Mapping
 from typing import Final
@@ -44,28 +45,20 @@ class SnapshotRing:
         """Messages younger than `seconds` that memory had no room for."""
         self.reason = ""
         """Description of the newest fault."""
+        self.memory = 0
+        """Bytes of memory in use, about."""
         self._ring: deque[tuple[str, bytes, int]] = deque()
-        self._bytes = 0
         self._most = most_bytes
         self._span_ns = round(seconds * NS_PER_S)
         self._until_ns: int | None = None
-        self._rows = {key: (key, topic) for key, topic in keys.items()}
-        self._special = {
-            key
-            for key, topic in keys.items()
-            if topic in (topics.JOINT_EVENT, topics.ESTOP, *STEADY)
-        }
+        watched = (topics.JOINT_EVENT, topics.ESTOP, *STEADY)
+        self._watched = {key: topic for key, topic in keys.items() if topic in watched}
         self._heard: dict[str, int] = {}
         self._decode = msgspec.json.Decoder(_Event).decode
 
     def __len__(self) -> int:
         """Return the number of messages in the ring."""
         return len(self._ring)
-
-    @property
-    def memory(self) -> int:
-        """Bytes of memory in use, about."""
-        return self._bytes
 
     @property
     def writing(self) -> bool:
@@ -75,30 +68,25 @@ class SnapshotRing:
     def take_from(self, source: MessageSource, at_most: int) -> int:
         """Store new messages; return their number."""
         taken = 0
-        ring, special = self._ring, self._special
         while taken < at_most and (item := source.take()) is not None:
             taken += 1
             key, payload, received_ns = item
-            row = self._rows.get(key)
-            if row is not None:
-                item = (row[0], payload, received_ns)  # one string for all messages of a key
-                if key in special:
-                    self._watch(row[1], item)
-            ring.append(item)
-            self._bytes += len(payload) + OVERHEAD
-        while self._bytes > self._most and ring:
-            self._bytes -= len(ring.popleft()[1]) + OVERHEAD
+            if (topic := self._watched.get(key)) is not None:
+                self._watch(topic, item)
+            # interned: one string for all messages of a key
+            self._ring.append((sys.intern(key), payload, received_ns))
+            self.memory += len(payload) + OVERHEAD
+        while self.memory > self._most and self._ring:
+            self._pop()
             self.dropped += 1
         return taken
 
-    def trigger(self, reason: str, now_ns: int) -> bool:
-        """Have the ring written; return True if it was not being written already."""
-        news = self._until_ns is None
-        if news:
+    def trigger(self, reason: str, now_ns: int) -> None:
+        """Have the ring written."""
+        if self._until_ns is None:
             self._forget_before(now_ns - self._span_ns)
         self._until_ns = now_ns + self._span_ns
         self.reason = reason
-        return news
 
     def pass_time(self, now_ns: int) -> None:
         """Detect silent senders, and drop messages older than the ring's length."""
@@ -116,9 +104,7 @@ class SnapshotRing:
         ring = self._ring
         if self._until_ns is None or not ring or ring[0][2] > self._until_ns:
             return None
-        item = ring.popleft()
-        self._bytes -= len(item[1]) + OVERHEAD
-        return item
+        return self._pop()
 
     def _watch(self, topic: Topic, item: tuple[str, bytes, int]) -> None:
         key, payload, received_ns = item
@@ -135,6 +121,10 @@ class SnapshotRing:
             self._heard[key] = received_ns
 
     def _forget_before(self, oldest_ns: int) -> None:
-        ring = self._ring
-        while ring and ring[0][2] < oldest_ns:
-            self._bytes -= len(ring.popleft()[1]) + OVERHEAD
+        while self._ring and self._ring[0][2] < oldest_ns:
+            self._pop()
+
+    def _pop(self) -> tuple[str, bytes, int]:
+        item = self._ring.popleft()
+        self.memory -= len(item[1]) + OVERHEAD
+        return item

@@ -73,6 +73,13 @@ def test_a_sender_that_never_sent_or_has_no_steady_rate_is_not_missed() -> None:
     assert not snapshot.writing
 
 
+def test_asked_for_it_is_written_without_a_fault() -> None:
+    snapshot = ring()
+    feed(snapshot, at(1))
+    snapshot.trigger("asked", NS_PER_S)
+    assert taken(snapshot) == [1.0]
+
+
 def test_a_second_fault_meanwhile_makes_it_longer() -> None:
     snapshot = ring(3.0)
     feed(snapshot, event(0, Mode.FAULT), event(2, Mode.FAULT), at(4.5), at(5.5))
