@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.joint.differential import motor_torque
-from services.joint.heat import HeatEstimate, report
+from services.joint.heat import HeatEstimate
 from services.planner.law.kinematics import Kinematics
 from shared.bus.messages import LEFT_MAX_S, HeatAction, Mode, PlannerMode
 from shared.bus.traces import SimTruth

@@ -266,30 +266,6 @@ def test_the_stand_in_compiles_without_a_warning_and_is_rebuilt_for_a_newer_sour
     subprocess.run([*command, "-o", tmp_path / "o", usb_standin.SOURCE], check=True)
 
 
-def test_what_a_compiler_complains_of_is_shown_and_nothing_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    program = tmp_path / "cc"
-    program.write_text("#!/bin/sh\necho no such header >&2; exit 1\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    with pytest.raises(FleetError, match="no such header"):
-        usb_standin.build(tmp_path / "lib")
-    assert list((tmp_path / "lib").iterdir()) == []
-
-
-def test_without_a_compiler_or_a_writable_folder_the_fix_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "lib").write_text("a file")
-    with pytest.raises(FleetError, match="a folder that can be written"):
-        usb_standin.build(tmp_path / "lib")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(FleetError, match="the C compiler `cc` is not on PATH; install one"):
-        usb_standin.build(tmp_path / "other")
-
-
 def test_it_prepares_paths_of_its_own_and_clears_them_but_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
