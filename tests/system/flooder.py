@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
 import random
 import socket
 import sys
@@ -42,8 +41,7 @@ VICTIMS: Final = ("planner", *MODULES, "recorder")
 def link(robot: RobotConfig, run_dir: Path, name: str = "operator") -> zenoh.Session:
     """Link to every process of the fleet."""
     endpoints = [expand(endpoint, run_dir) for endpoint in robot.bus.endpoints.values()]
-    secured = robot.bus.security.mode == "mtls"
-    return stranger(endpoints, identity(Path(robot.bus.security.keys), name) if secured else None)
+    return stranger(endpoints, identity(Path(robot.bus.security.keys), name))
 
 
 def steadily(work: Callable[[], object], per_s: int = PER_S) -> Iterator[None]:
@@ -81,23 +79,9 @@ def messages(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
     yield from steadily(put)
 
 
-def garbage(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """Put payloads that are no messages on the commands' keys."""
-    session = link(robot, run_dir)
-    publishers = [session.declare_publisher(f"xrl/{robot.name}/joint/{m}/command") for m in MODULES]
-    each = itertools.cycle(publishers)
-    yield from steadily(lambda: next(each).put(os.urandom(300)))
-
-
 def connect(endpoint: str, source: str = STRANGER) -> socket.socket:
     """Open a bare connection to an endpoint of the bus."""
-    kind, _, rest = endpoint.partition("/")
-    if kind == "unixsock-stream":
-        one = socket.socket(socket.AF_UNIX)
-        one.settimeout(0.2)
-        one.connect(rest)
-        return one
-    host, _, port = rest.rpartition(":")
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
     return socket.create_connection((host, int(port)), timeout=0.2, source_address=(source, 0))
 
 
@@ -138,7 +122,7 @@ def rubbish(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
         yield
 
 
-KINDS: Final = {"messages": messages, "garbage": garbage, "held": held, "rubbish": rubbish}
+KINDS: Final = {"messages": messages, "held": held, "rubbish": rubbish}
 
 
 def main() -> None:

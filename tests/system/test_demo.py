@@ -38,15 +38,10 @@ def test_a_robot_that_cannot_stand_is_a_finding_and_not_an_error(tmp_path: Path)
     assert json.loads((tmp_path / "summary.json").read_text())["stood"] is False
 
 
-@pytest.mark.parametrize(
-    ("verb", "said"), [("demo", "interrupted"), ("study crash --only kill-*", "stopped; 0 of")]
-)
-def test_one_that_is_interrupted_leaves_nothing_behind(
-    verb: str, said: str, tmp_path: Path
-) -> None:
+def test_one_that_is_interrupted_leaves_nothing_behind(tmp_path: Path) -> None:
     with leaving_nothing() as mine:
         process = subprocess.Popen(
-            command(*verb.split(), "--out", tmp_path), cwd=CHECKOUT,
+            command("demo", "--out", tmp_path), cwd=CHECKOUT,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         )  # fmt: skip
         while not mine():
@@ -56,7 +51,7 @@ def test_one_that_is_interrupted_leaves_nothing_behind(
         os.killpg(process.pid, signal.SIGINT)
         output, _ = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert said in output
+    assert "interrupted" in output
 
 
 def test_the_robot_stands_when_a_knees_service_is_killed_in_the_squat(tmp_path: Path) -> None:
