@@ -62,7 +62,7 @@ EXPANDED_MIN: Final = 1 << 28
 """Bytes that any file may expand to."""
 
 
-class LostBytes(NamedTuple):
+class LostBytes(msgspec.Struct, frozen=True):
     """Bytes that hold nothing readable, and when they were written if they still say it."""
 
     start: int
