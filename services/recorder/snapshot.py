@@ -7,7 +7,6 @@ are written; another fault extends that. Memory is bounded: the oldest messages 
 
 from __future__ import annotations
 
-import sys
 from collections import deque
 from collections.abc import Mapping
 from typing import Final
@@ -53,6 +52,8 @@ class SnapshotRing:
         self._until_ns: int | None = None
         watched = (topics.JOINT_EVENT, topics.ESTOP, *STEADY)
         self._watched = {key: topic for key, topic in keys.items() if topic in watched}
+        self._keys = {key: key for key in keys}
+        """One string for all messages of a key."""
         self._heard: dict[str, int] = {}
         self._decode = msgspec.json.Decoder(_Event).decode
 
@@ -73,8 +74,7 @@ class SnapshotRing:
             key, payload, received_ns = item
             if (topic := self._watched.get(key)) is not None:
                 self._watch(topic, item)
-            # interned: one string for all messages of a key
-            self._ring.append((sys.intern(key), payload, received_ns))
+            self._ring.append((self._keys.get(key, key), payload, received_ns))
             self.memory += len(payload) + OVERHEAD
         while self.memory > self._most and self._ring:
             self._pop()

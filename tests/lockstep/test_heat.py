@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.joint.differential import motor_torque
-from services.joint.heat import HeatEstimate
+from services.joint.heat import HeatEstimate, report
 from services.planner.law.kinematics import Kinematics
 from shared.bus.messages import LEFT_MAX_S, HeatAction, Mode, PlannerMode
 from shared.bus.traces import SimTruth
@@ -33,14 +33,14 @@ class Held(NamedTuple):
     derating: float
 
 
-def hold(robot: RobotConfig, start: FleetMoment, *, hand: bool) -> Held:
-    """Squat, let the time pass for the temperatures until 33 s are left, and run on until it rests.
-
-    At most until 16 s.
-    """
-    fleet = Lockstep(robot, led_to((2.0, SQUAT), duration=16.0))
+def hold(
+    robot: RobotConfig, start: FleetMoment, *, hand: bool = True, until_s: float = 16.0,
+    skip: bool = True,
+) -> Held:  # fmt: skip
+    """Squat, let the time pass for the temperatures until 33 s are left, and run on."""
+    fleet = Lockstep(robot, led_to((2.0, SQUAT), duration=until_s))
     fleet.resume(start)
-    rows, actions, derating, skips = [], [], 1.0, True
+    rows, actions, derating, skips = [], [], 1.0, skip
     for row in fleet.run():
         rows.append(row)
         if not hand and row.scenario_s > 0.5 * HELD_S:
@@ -48,13 +48,12 @@ def hold(robot: RobotConfig, start: FleetMoment, *, hand: bool) -> Held:
         if skips and row.scenario_s > HELD_S:
             skips = False
             while min(law.heat.left_s for law in fleet.controllers) > 33.0:
-                fleet.skip_heat(1.0)
-        status = status_of(fleet)
-        actions.append(status.heat)
+                fleet.bank.heat.skip(fleet.bank.heat.load, 1.0)
+                for joint, law in zip(fleet.joints, fleet.controllers, strict=True):
+                    joint.manager.controller.heat.skip(law.heat, 1.0)
+                    report(law.heat, *joint.drive.thermistors())
+        actions.append(status_of(fleet).heat)
         derating = min(derating, fleet.bank.heat.derating)
-        rests = status.heat == HeatAction.RESTS and status.heat_left_s > 60.0
-        if rests and row.torso[2] > 1.2:
-            break
     return Held(fleet, rows, actions, derating)
 
 
@@ -75,6 +74,14 @@ def test_a_robot_too_hot_for_its_squat_stands_up_by_itself_and_derates_nowhere(
     assert status.heat_left_s > 60.0
     assert max(abs(1e3 * row.com[0]) for row in held.rows) < 15.0
     assert max(law.heat.winding[0] for law in held.fleet.controllers) < 100.0
+
+
+def test_without_an_estimate_nothing_is_said_and_nothing_done(robot: RobotConfig) -> None:
+    heat = msgspec.structs.replace(robot.heat, estimate=False)
+    deaf = msgspec.structs.replace(robot, heat=heat)
+    held = hold(deaf, standing_as(deaf), skip=False, until_s=1.0)
+    assert set(held.actions) == {HeatAction.NONE}
+    assert status_of(held.fleet).heat_left_s == -1.0
 
 
 @pytest.mark.parametrize(

@@ -238,8 +238,7 @@ def lean(newtons: float, at: float = 2.8) -> Push:
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("delay_ms", [1.0, 10.0])
 @pytest.mark.parametrize(
-    ("height", "pitch", "newtons"),
-    [(1.188, 0.0, 60.0), (0.79, 1.2, 85.0), (0.95, 0.0, 65.0)],
+    ("height", "pitch", "newtons"), [(1.188, 0.0, 60.0), (0.79, 1.2, 85.0), (0.95, 0.0, 65.0)]
 )
 def test_leaned_on_from_the_side_it_holds_and_is_led_again(
     robot: RobotConfig, height: float, pitch: float, newtons: float, delay_ms: float

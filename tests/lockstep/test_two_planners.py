@@ -13,7 +13,7 @@ from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.config.scenarios import Inject, Kill
-from shared.joints import MODULE_INDEX
+from shared.joints import MODULE_INDEX, MODULES
 from tests.lockstep.runs import kill, led_to, modes_of, restart
 from tests.robots import ROBOT
 from tools.sim.lockstep import Lockstep, begin_standing
@@ -56,8 +56,8 @@ class TwoPlanners(Lockstep):
         elif self.second is None:
             self.second = Planner(self.config, SECOND)
         if self.second is not None and self.second.is_due(self.now_ns):
-            for index, command in enumerate(self.second.tick(self.now_ns)):
-                self.network.commands()[index].put(self.now_ns, command)
+            for name, command in zip(MODULES, self.second.tick(self.now_ns), strict=False):
+                self.network.links[f"planner->{name}"].put(self.now_ns, command)
                 age_ms = (self.now_ns - command.echo_t_ns) / NS_PER_MS
                 usable = age_ms <= self.config.joint_service.max_command_age_ms
                 self.sent += usable

@@ -167,12 +167,8 @@ class Lockstep:
                 return self.planner_type(config, session)
             return Planner(config, session, controller())
 
-        def request() -> OperatorRequest:
-            wanted = robot.world.lead()
-            return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
-
         self._planner = VirtualPlanner(
-            config, new_planner, request, network_, record,
+            config, new_planner, self._request, network_, record,
             time=time, clock=clock_of["planner"], traced=traced,
             beside=self._memory if planner_beside else None,
         )  # fmt: skip
@@ -190,6 +186,11 @@ class Lockstep:
         ]  # fmt: skip
         happens: list[Happening] = [*scenario.kill, *scenario.restart, *scenario.push, *hand]
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
+
+    def _request(self) -> OperatorRequest:
+        """Return what the operator asks of the planner."""
+        wanted = self.world.lead()
+        return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
 
     @property
     def now_ns(self) -> int:

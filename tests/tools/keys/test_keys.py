@@ -90,7 +90,7 @@ def test_a_bundle_holds_what_its_host_runs_and_never_the_authoritys_key(
     assert stat.S_IMODE(out.stat().st_mode) == 0o600
     with tarfile.open(out) as tar:
         assert {entry.mode for entry in tar} == {0o600}
-        tar.extractall(tmp_path / "host", filter="data")
+        tar.extractall(tmp_path / "host")  # noqa: S202 - its own; Python 3.11.2 knows no filter
     assert set(contents(tmp_path / "host" / "keys")) == {
         "authority.pem", "names.toml",
         "knee_left.pem", "knee_left.key", "hip_left.pem", "hip_left.key",
