@@ -48,7 +48,7 @@ def require(extra: str, otherwise: str = "") -> None:
     """
     missing = [name for name in EXTRAS[extra] if not _is_there(name)]
     if missing:
-        raise missing_package(extra, missing, otherwise)
+        raise _missing_package(extra, missing, otherwise)
     for name in EXTRAS[extra]:
         _imported(name, otherwise)
 
@@ -67,7 +67,7 @@ def _is_there(package: str) -> bool:
     return any(Path(folder).resolve().parent != CHECKOUT / "deploy" for folder in folders)
 
 
-def missing_package(extra: str, missing: list[str], otherwise: str = "") -> MissingPackageError:
+def _missing_package(extra: str, missing: list[str], otherwise: str = "") -> MissingPackageError:
     """Return the error that names packages, their extra and the command that brings it."""
     *others, last = missing
     are, them = ("are", "them") if others else ("is", "it")
@@ -102,7 +102,7 @@ def _imported(module: str, otherwise: str = "") -> ModuleType:
         if extra is None:
             raise
         if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
-            raise missing_package(extra, [package], otherwise) from None
+            raise _missing_package(extra, [package], otherwise) from None
         said = " ".join(str(error).split()) or type(error).__name__
         trouble = f"{package} is installed and cannot be imported: {said}"
         raise _error(trouble, extra, "it", otherwise) from error

@@ -21,7 +21,7 @@ PINNED_VARIABLE: Final = "XRL_PINNED"
 process table sets it (`deploy/processes.toml`)."""
 
 
-class ProcessSchedule(NamedTuple):
+class _ProcessSchedule(NamedTuple):
     """A process's row."""
 
     fifo: int
@@ -30,14 +30,14 @@ class ProcessSchedule(NamedTuple):
     """Half of the processors: a leg and who feeds it share their caches."""
 
 
-TABLE: Final[dict[str, ProcessSchedule]] = {
-    "simulator": ProcessSchedule(25, "first"),
-    "joint": ProcessSchedule(20, "by leg"),
-    "planner": ProcessSchedule(15, "second"),
-    "network_proxy": ProcessSchedule(15, "first"),
-    "harness": ProcessSchedule(10, "first"),
-    "imu": ProcessSchedule(10, "first"),
-    "recorder": ProcessSchedule(5, "second"),
+TABLE: Final[dict[str, _ProcessSchedule]] = {
+    "simulator": _ProcessSchedule(25, "first"),
+    "joint": _ProcessSchedule(20, "by leg"),
+    "planner": _ProcessSchedule(15, "second"),
+    "network_proxy": _ProcessSchedule(15, "first"),
+    "harness": _ProcessSchedule(10, "first"),
+    "imu": _ProcessSchedule(10, "first"),
+    "recorder": _ProcessSchedule(5, "second"),
 }
 """By kind of process. The right leg is on the first half, the left leg on the second. Without real
 time the recorder lost 600 and 1200 messages in a demo, on any processor."""
@@ -64,7 +64,7 @@ def apply(kind: str, module: str = "") -> str:
     granted = [raise_priority(TABLE[kind].fifo)]
     if os.environ.get(PINNED_VARIABLE) == "1":
         granted.append(_pin(half_of(os.sched_getaffinity(0), kind, module)))
-    if lock_memory():
+    if _lock_memory():
         granted.append("memory locked")
     return ", ".join(granted)
 
@@ -164,7 +164,7 @@ def short_slice() -> str:
     return ", ".join(granted) or "normal priority"
 
 
-def lock_memory() -> bool:
+def _lock_memory() -> bool:
     """Keep in memory every page that this process has touched or will touch; True if granted.
 
     Pages that are never touched, such as most of each thread's stack, take no memory. Under a limit

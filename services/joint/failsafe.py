@@ -323,10 +323,10 @@ class Failsafe(msgspec.Struct):
             counted = TICKS_PER_S_MAX * (now_ns - self.command.echo_t_ns) / NS_PER_S
             if ahead > SEQ_AHEAD_MAX + counted:
                 return Refusal.TOO_FAR_AHEAD
-        return _USABLE if within_limits(command, timing) else Refusal.OUT_OF_LIMITS
+        return _USABLE if _within_limits(command, timing) else Refusal.OUT_OF_LIMITS
 
 
-def within_limits(command: JointCommand, timing: Timing) -> bool:
+def _within_limits(command: JointCommand, timing: Timing) -> bool:
     """Return True if every number is finite and inside the service's limits.
 
     Written so that a NaN fails: every comparison with it is false.

@@ -58,7 +58,7 @@ def requests_of(
     return request
 
 
-class Checkpoints:
+class _Checkpoints:
     """Says when the planner's state is recorded, so that re-execution can start from it.
 
     After every tick whose number is a power of two, then once a second. It is frequent at first,
@@ -110,7 +110,7 @@ class PlannerLoop:
         self._ports, self._clock = ports, clock or now_ns
         self._period_ns = round(NS_PER_S / config.planner.rate_hz)
         self._due_ns = 0
-        self._checkpoints = Checkpoints(config.planner.rate_hz)
+        self._checkpoints = _Checkpoints(config.planner.rate_hz)
         self._yielded = False
         self._announced = 0
 

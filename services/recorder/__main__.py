@@ -49,7 +49,7 @@ LAST_WORDS_S: Final = 0.1
 SNAPSHOT_MAX_S: Final = 3600.0
 
 
-class SnapshotRequest:
+class _SnapshotRequest:
     """True once after each SIGUSR1: write the snapshot."""
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class SnapshotRequest:
 def main() -> int:
     """Run the recorder; return the exit code."""
     os.umask(0o027)  # a record may be read by the group, and is nobody's to change
-    stop, asked = StopFlag(), SnapshotRequest()
+    stop, asked = StopFlag(), _SnapshotRequest()
     logger = log.setup("recorder")
     arguments = _arguments()
     config = load(arguments.config)
@@ -139,7 +139,7 @@ def _recorded(robot: str, of: tuple[str, ...] | None) -> dict[str, topics.Topic]
 def _record(
     recording: Recorder,
     stop: StopFlag,
-    asked: SnapshotRequest,
+    asked: _SnapshotRequest,
     roster: Roster | None,
     host: RunDirWatch,
 ) -> None:

@@ -76,7 +76,7 @@ def main() -> int:
             asked=session.latest(topics.OPERATOR_INTENT, OperatorIntent),
             hand=session.latest(topics.OPERATOR_HAND, HandLead),
         )
-        hubs = open_hubs(robot, arguments.run_dir, stack)
+        hubs = _open_hubs(robot, arguments.run_dir, stack)
         made = SimulatedRobot(
             robot, true_plant, scenario, cells=hubs[robot.harness.bus],
             imu=hubs[robot.imu.bus] if robot.imu.fitted else None, seed=arguments.seed,
@@ -90,7 +90,7 @@ def main() -> int:
             heartbeat_period_ms=robot.drive.heartbeat_period_ms,
             dialect=robot.simulation.can_dialect,
         )
-        usb = open_usb(robot, made.bank, arguments.run_dir, stack)
+        usb = _open_usb(robot, made.bank, arguments.run_dir, stack)
         logger.info("up, %s, scenario %s", granted, scenario.name)
         freeze_garbage()
         loop = SimulatorLoop(robot, made, front, usb, ports)
@@ -100,7 +100,7 @@ def main() -> int:
     return 0
 
 
-def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
+def _open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
     """Return the CAN buses of the robot, simulated, by name."""
     make_live_dir(run_dir)
     sensors = [robot.harness.bus, *([robot.imu.bus] if robot.imu.fitted else [])]
@@ -113,7 +113,9 @@ def open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, 
     return hubs
 
 
-def open_usb(robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack) -> list[FibreHub]:
+def _open_usb(
+    robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack
+) -> list[FibreHub]:
     """Return the drives' USB plugs, in {run}/usb, for the modules that have serial numbers.
 
     An ODrive v3 has USB beside CAN, so they are there whichever the services use.

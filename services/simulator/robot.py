@@ -191,7 +191,7 @@ class FaultInjector:
         for fault in begun:
             self._coming.remove(fault)
             if fault.kind in _AT_ONCE:
-                self._bank.inject(AXIS_NAMES[axis_of(fault)], _AT_ONCE[fault.kind])
+                self._bank.inject(AXIS_NAMES[_axis_of(fault)], _AT_ONCE[fault.kind])
             else:
                 self._lasting.append(fault)
                 self._act(fault, begins=True)
@@ -203,7 +203,7 @@ class FaultInjector:
 
     def _act(self, fault: Fault, *, begins: bool) -> None:
         """Bring a drive into a lasting fault, or out of it."""
-        bank, axis = self._bank, axis_of(fault)
+        bank, axis = self._bank, _axis_of(fault)
         drive = axis >> 1
         match fault.kind:
             case "over_temperature":
@@ -228,6 +228,6 @@ class FaultInjector:
                 raise DriveError(f"{fault.kind}: no lasting fault of the emulated drives")
 
 
-def axis_of(fault: Fault) -> int:
+def _axis_of(fault: Fault) -> int:
     """Return the axis (0 .. 11) that a fault is of; of the whole ODrive, its first."""
     return 2 * MODULE_INDEX[fault.module] + (fault.axis or 0)

@@ -59,7 +59,7 @@ class Need(NamedTuple):
     """CAN node of the axis; None: not known here, and not wanted."""
 
 
-class Setting(NamedTuple):
+class _Setting(NamedTuple):
     """One row of the table."""
 
     name: str
@@ -91,66 +91,66 @@ class WantedSetting(NamedTuple):
         return f"{self.compare.value}{describe_value(self.value)}"
 
 
-AXIS_TABLE: Final[tuple[Setting, ...]] = (
-    Setting("config.watchdog_timeout", lambda need: need.drive.watchdog_timeout,
+AXIS_TABLE: Final[tuple[_Setting, ...]] = (
+    _Setting("config.watchdog_timeout", lambda need: need.drive.watchdog_timeout,
         "a drive left alone stops after this; too short, a hiccup disarms"),
-    Setting("config.enable_watchdog",
+    _Setting("config.enable_watchdog",
         lambda need: need.watchdog and need.drive.watchdog_timeout > 0.0,
         "a watchdog that fires lets the module go limp: off with the onboard loop, else on"),
-    Setting("config.startup_motor_calibration", lambda _: False,
+    _Setting("config.startup_motor_calibration", lambda _: False,
         "the motor would move by itself at power-up"),
-    Setting("config.startup_encoder_offset_calibration", lambda _: False,
+    _Setting("config.startup_encoder_offset_calibration", lambda _: False,
         "the motor would turn by itself at power-up"),
-    Setting("config.startup_closed_loop_control", lambda _: False,
+    _Setting("config.startup_closed_loop_control", lambda _: False,
         "the axis would arm by itself at power-up, before anything looks after it"),
-    Setting("config.can.node_id", lambda need: need.node_id,
+    _Setting("config.can.node_id", lambda need: need.node_id,
         "the services would speak to another axis, or to none"),
-    Setting("config.can.heartbeat_rate_ms", lambda need: need.drive.heartbeat_period_ms,
+    _Setting("config.can.heartbeat_rate_ms", lambda need: need.drive.heartbeat_period_ms,
         "an axis that disarms shows in its next heartbeat only"),
-    Setting("config.can.encoder_rate_ms", lambda need: need.drive.encoder_period_ms,
+    _Setting("config.can.encoder_rate_ms", lambda need: need.drive.encoder_period_ms,
         "the encoder frames are the joint service's clock; as shipped they come at 100 Hz"),
-    Setting("controller.config.input_mode", lambda _: int(InputMode.PASSTHROUGH),
+    _Setting("controller.config.input_mode", lambda _: int(InputMode.PASSTHROUGH),
         "any other mode filters or ignores the targets"),
-    Setting("controller.config.vel_integrator_gain", lambda _: 0.0,
+    _Setting("controller.config.vel_integrator_gain", lambda _: 0.0,
         "an integrator winds up under the robot's weight; the law has none in the drive"),
-    Setting("controller.config.vel_limit", lambda need: need.drive.vel_limit,
+    _Setting("controller.config.vel_limit", lambda need: need.drive.vel_limit,
         "faster than this times vel_limit_tolerance disarms with OVERSPEED, in torque mode too"),
-    Setting("controller.config.vel_limit_tolerance", lambda _: OVERSPEED_TOLERANCE,
+    _Setting("controller.config.vel_limit_tolerance", lambda _: OVERSPEED_TOLERANCE,
         "OVERSPEED would fire close to vel_limit", Compare.AT_LEAST),
-    Setting("controller.config.enable_overspeed_error", lambda _: True,
+    _Setting("controller.config.enable_overspeed_error", lambda _: True,
         "a motor that runs away would not be stopped"),
-    Setting("controller.config.enable_torque_mode_vel_limit", lambda _: False,
+    _Setting("controller.config.enable_torque_mode_vel_limit", lambda _: False,
         "in torque mode it cuts the torque by vel_gain: with that at 0, all of it"),
-    Setting("controller.config.spinout_electrical_power_threshold", lambda _: SPINOUT_POWER,
+    _Setting("controller.config.spinout_electrical_power_threshold", lambda _: SPINOUT_POWER,
         "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
         Compare.AT_LEAST),
-    Setting("controller.config.spinout_mechanical_power_threshold", lambda _: -SPINOUT_POWER,
+    _Setting("controller.config.spinout_mechanical_power_threshold", lambda _: -SPINOUT_POWER,
         "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
         Compare.AT_MOST),
-    Setting("motor.config.pre_calibrated", lambda _: True,
+    _Setting("motor.config.pre_calibrated", lambda _: True,
         "after each power-up the motor would have to be calibrated before it arms"),
-    Setting("motor.config.torque_constant", lambda need: need.drive.torque_constant,
+    _Setting("motor.config.torque_constant", lambda need: need.drive.torque_constant,
         "every torque would be wrong by the ratio"),
-    Setting("motor.config.current_lim", lambda need: need.drive.current_lim,
+    _Setting("motor.config.current_lim", lambda need: need.drive.current_lim,
         "less (10 A as shipped) cannot carry the robot, more is not what the robot file checks"),
-    Setting("motor.fet_thermistor.config.enabled", lambda _: True,
+    _Setting("motor.fet_thermistor.config.enabled", lambda _: True,
         "the output stage would not protect itself"),
-    Setting("encoder.config.cpr", lambda need: need.encoder_counts_per_turn,
+    _Setting("encoder.config.cpr", lambda need: need.encoder_counts_per_turn,
         "every angle would be wrong by the ratio"),
-    Setting("encoder.config.bandwidth", lambda need: need.drive.encoder_bandwidth,
+    _Setting("encoder.config.bandwidth", lambda need: need.drive.encoder_bandwidth,
         "slower, the drive's damping comes late and shakes the rotors; faster, it is noisy"),
-    Setting("encoder.config.pre_calibrated", lambda _: True,
+    _Setting("encoder.config.pre_calibrated", lambda _: True,
         "after each power-up the motor would have to turn by itself before it arms"),
 )  # fmt: skip
 """Settings of each axis, in the order in which they are written: a watchdog that is enabled before
 its timeout is there has nothing to count down, and expires at once."""
 
-DRIVE_TABLE: Final[tuple[Setting, ...]] = (
-    Setting("config.dc_max_negative_current", lambda need: need.drive.dc_max_negative_current,
+DRIVE_TABLE: Final[tuple[_Setting, ...]] = (
+    _Setting("config.dc_max_negative_current", lambda need: need.drive.dc_max_negative_current,
         "braking legs push current back; -0.01 A as shipped trips both axes at once"),
-    Setting("config.dc_bus_overvoltage_trip_level", lambda _: OVERVOLTAGE_MAX,
+    _Setting("config.dc_bus_overvoltage_trip_level", lambda _: OVERVOLTAGE_MAX,
         "what braking legs push back could destroy the output stage", Compare.AT_MOST),
-    Setting("can.config.baud_rate", lambda _: CAN_BAUD_RATE,
+    _Setting("can.config.baud_rate", lambda _: CAN_BAUD_RATE,
         "the bus carries two axes at the joint services' rate at 1 Mbit/s only"),
 )  # fmt: skip
 """Settings of the whole ODrive."""
@@ -188,7 +188,7 @@ def describe_value(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _worked_out(setting: Setting, need: Need, prefix: str) -> WantedSetting | None:
+def _worked_out(setting: _Setting, need: Need, prefix: str) -> WantedSetting | None:
     value = setting.wanted(need)
     if value is None:
         return None

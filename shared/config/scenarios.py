@@ -89,7 +89,7 @@ FaultKind = Literal[
 ]
 
 
-class FaultTraits(NamedTuple):
+class _FaultTraits(NamedTuple):
     """Properties of a kind of fault."""
 
     about: str
@@ -99,24 +99,24 @@ class FaultTraits(NamedTuple):
     """True if it affects the whole ODrive, not one of its axes."""
 
 
-FAULT_KINDS: Final[Mapping[str, FaultTraits]] = {
-    "over_temperature": FaultTraits("an output stage too hot", 5.0, whole=False),
-    "over_voltage": FaultTraits("the supply too high", 0.1, whole=True),
-    "encoder": FaultTraits("an encoder sends no more words", 5.0, whole=False),
-    "watchdog": FaultTraits("an axis's watchdog fires", None, whole=False),
-    "link_lost": FaultTraits("the cable out: nothing sent, nothing heard", 0.5, whole=True),
-    "disarmed": FaultTraits("an axis goes idle without an error", None, whole=False),
-    "overspeed": FaultTraits("an axis disarms for its speed", None, whole=False),
-    "brown_out": FaultTraits("no power, then a restart", 0.2, whole=True),
-    "encoder_zero": FaultTraits("an encoder reads 0, which is a valid word", 5.0, whole=False),
-    "encoder_gap": FaultTraits(
+FAULT_KINDS: Final[Mapping[str, _FaultTraits]] = {
+    "over_temperature": _FaultTraits("an output stage too hot", 5.0, whole=False),
+    "over_voltage": _FaultTraits("the supply too high", 0.1, whole=True),
+    "encoder": _FaultTraits("an encoder sends no more words", 5.0, whole=False),
+    "watchdog": _FaultTraits("an axis's watchdog fires", None, whole=False),
+    "link_lost": _FaultTraits("the cable out: nothing sent, nothing heard", 0.5, whole=True),
+    "disarmed": _FaultTraits("an axis goes idle without an error", None, whole=False),
+    "overspeed": _FaultTraits("an axis disarms for its speed", None, whole=False),
+    "brown_out": _FaultTraits("no power, then a restart", 0.2, whole=True),
+    "encoder_zero": _FaultTraits("an encoder reads 0, which is a valid word", 5.0, whole=False),
+    "encoder_gap": _FaultTraits(
         "a gap in an encoder's words, too short for an error", 0.045, whole=False
     ),
-    "no_ack": FaultTraits("it sends, and hears and acknowledges nothing", 0.5, whole=True),
-    "bus_full": FaultTraits(
+    "no_ack": _FaultTraits("it sends, and hears and acknowledges nothing", 0.5, whole=True),
+    "bus_full": _FaultTraits(
         "its bus's send queue full for 40 ms of each 100 ms (ENOBUFS)", 2.0, whole=True
     ),
-    "bus_flap": FaultTraits("its bus dead for 60 ms of each 150 ms", 2.0, whole=True),
+    "bus_flap": _FaultTraits("its bus dead for 60 ms of each 150 ms", 2.0, whole=True),
 }
 """Faults by name. An axis that disarms floats; its sibling keeps its torque."""
 

@@ -122,7 +122,7 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
     with open_log(path) as reader:
         try:
             with atomic_file(out, lasting=True) as file:
-                copy = LogCopy(file, reader.raw)
+                copy = _LogCopy(file, reader.raw)
                 for record in reader:
                     if stop():
                         raise Interrupted
@@ -224,7 +224,7 @@ def clock_time(time_ns: int) -> str:
     return date.isoformat(sep=" ", timespec="milliseconds")
 
 
-def _note(path: Path, copy: LogCopy, reader: LogReader) -> Metadata:
+def _note(path: Path, copy: _LogCopy, reader: LogReader) -> Metadata:
     losses = [*reader.damage, *([reader.cut] if reader.cut else [])]
     lost = sum(loss.end - loss.start for loss in losses if loss.missing is None)
     note = {"from": path.name, "messages": str(copy.counts.message_count), "lost_bytes": str(lost)}
@@ -238,7 +238,7 @@ def _when(loss: LostBytes) -> str:
     return f": {seconds:.3f} s up to {clock_time(loss.last_ns)}"
 
 
-class LogCopy:
+class _LogCopy:
     """Takes the records of a file in their order and writes what a finished file needs.
 
     `raw` gives the original's bytes from one offset to another.

@@ -71,7 +71,7 @@ class FilePlace(Enum):
     REMOVED = "removed"
 
 
-class MessageHead(msgspec.Struct, gc=False):
+class _MessageHead(msgspec.Struct, gc=False):
     """The two fields of a message that the recorder needs; the rest is skipped over."""
 
     t_ns: Annotated[int, _UNSIGNED]
@@ -127,7 +127,7 @@ class RunWriter:
         self._channels: dict[str, tuple[int, KeyCount]] = {}
         self._before: dict[str, KeyCount] = {}
         """Counts at the start of the file."""
-        self._decode = msgspec.json.Decoder(MessageHead).decode
+        self._decode = msgspec.json.Decoder(_MessageHead).decode
         self._file: BinaryIO | None = None
         self._syncer = files.FsyncThread()
         if begin:

@@ -108,7 +108,7 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
 """By the name that scenarios and `--fault` use."""
 
 
-class LossRow(NamedTuple):
+class _LossRow(NamedTuple):
     """A lost process or link, or the emergency stop."""
 
     module: str
@@ -120,8 +120,8 @@ class LossRow(NamedTuple):
     recovery: str
 
 
-LOSSES: Final[dict[str, LossRow]] = {
-    "joint service killed or hung": LossRow(
+LOSSES: Final[dict[str, _LossRow]] = {
+    "joint service killed or hung": _LossRow(
         "its drive's own loop holds, with the coupled torque frozen",
         "HOLD: the planner asks for it when the module's state is stale",
         "`xrl status`: no states, restarts; planner/status: hold",
@@ -129,38 +129,38 @@ LOSSES: Final[dict[str, LossRow]] = {
         "and all track again. A hung service: `xrl kill`. If the drive lost torque meanwhile: hang "
         "the robot, then `xrl kill`",
     ),
-    "planner killed or hung": LossRow(
+    "planner killed or hung": _LossRow(
         "HOLD within max_command_age: local gains, references frozen",
         "the same",
         "`xrl status`: HOLD because PLANNER_ENDED (its process ended, same host) or COMMAND_STALE",
         "automatic: a new planner starts from the measured pose and leads after a blend",
     ),
-    "bus slow, lossy or cut": LossRow(
+    "bus slow, lossy or cut": _LossRow(
         "HOLD when its commands are too old",
         "HOLD: the planner asks for it",
         "`xrl status`: HOLD, ages, drop-outs",
         "automatic, after a wait that each drop-out doubles",
     ),
-    "harness lost": LossRow(
+    "harness lost": _LossRow(
         "nothing",
         "the planner leads on without closed assist force and without easing the lead; no overload "
         "and no trip by harness, sagging or unattended is seen, and one that is there stays",
         "harness/wrench: not valid",
         "automatic; a trip that stays ends with the harness back, or by `xrl kill planner`",
     ),
-    "IMU lost, where one is fitted": LossRow(
+    "IMU lost, where one is fitted": _LossRow(
         "nothing",
         "the planner leads on with the last slope; a new planner takes the floor as level",
         "imu/attitude: not valid",
         "automatic",
     ),
-    "recorder lost": LossRow(
+    "recorder lost": _LossRow(
         "nothing",
         "nothing",
         "`xrl status`: restarts",
         "automatic: a new file; the old one is readable as far as it was flushed",
     ),
-    "emergency stop": LossRow(
+    "emergency stop": _LossRow(
         "DAMP: knees sink slowly, hips keep the torso's attitude, ankles keep the hips above the "
         "feet, frontal axes hold; beside any module of the host that does not go down with them "
         "all hold where they are",
@@ -168,26 +168,26 @@ LOSSES: Final[dict[str, LossRow]] = {
         "`xrl status`: DAMP because ESTOP",
         "once the robot is at rest: `xrl rearm` re-arms all six together, or none",
     ),
-    "feet away from their place before the planner leads": LossRow(
+    "feet away from their place before the planner leads": _LossRow(
         "HOLD",
         "HOLD",
         "planner/status: MISPLACED; `xrl status` says which way",
         "automatic, when the feet stand within `law.stance_max` of their place",
     ),
-    "a load far from the robot file's": LossRow(
+    "a load far from the robot file's": _LossRow(
         "HOLD",
         "HOLD",
         "planner/status: MISLOADED; `xrl status` says by how much",
         "automatic, when the load is within `law.load_correction`; or set mass.payload, then "
         "`xrl gains`",
     ),
-    "a trip": LossRow(
+    "a trip": _LossRow(
         "HOLD: the module trips by itself on shaking, torque or speed",
         "HOLD, on the planner's request; the planner's own trips hold all six",
         "`xrl status`: because SHAKING, TORQUE_LIMIT, TOO_FAST; planner/status: TRIPPED, and why",
         "automatic, after a wait that each trip lengthens",
     ),
-    "overload at the harness": LossRow(
+    "overload at the harness": _LossRow(
         "HOLD",
         "HOLD",
         "planner/status: OVERLOADED",

@@ -37,7 +37,7 @@ def body_frames(geometry: GeometryConfig, q: Sequence[float]) -> list[FramePose]
     """Return the frames on the torso and below it, at joint angles (12,), rad."""
     harness = FramePose("torso", "harness", geometry.harness_point, UPRIGHT)
     modules = (
-        FramePose(parent, module, position, module_rotation(*joint_pair(q, module)))
+        FramePose(parent, module, position, _module_rotation(*_joint_pair(q, module)))
         for side in SIDES
         for parent, module, position in leg_modules(geometry, side)
     )
@@ -57,7 +57,7 @@ def leg_modules(geometry: GeometryConfig, side: str) -> tuple[tuple[str, str, Ve
     )
 
 
-def joint_pair(q: Sequence[float], module: str) -> tuple[float, float]:
+def _joint_pair(q: Sequence[float], module: str) -> tuple[float, float]:
     """Return (phi, theta) of a module out of the joint angles (12,), rad."""
     number = 2 * MODULE_INDEX[module]
     return q[number], q[number + 1]
@@ -108,7 +108,7 @@ def _ankle_in_torso(
     for _, module, offset in leg_modules(geometry, side):
         x, y, z = rotated(rotation, offset)
         position = position[0] + x, position[1] + y, position[2] + z
-        rotation = product(rotation, module_rotation(*joint_pair(q, module)))
+        rotation = product(rotation, _module_rotation(*_joint_pair(q, module)))
     return position, rotation
 
 
@@ -120,7 +120,7 @@ def torso_rotation(angles: Vector3) -> Quaternion:
     )
 
 
-def module_rotation(phi: float, theta: float) -> Quaternion:
+def _module_rotation(phi: float, theta: float) -> Quaternion:
     """Return the rotation of the part below a module in the part above it.
 
     From the foot up a module is Rx(phi) Ry(theta); from the torso down it is the inverse.

@@ -140,7 +140,7 @@ def procedures(board: Board, axis: str) -> tuple[Procedure, Procedure]:
     )
 
 
-def scan_turns(values: Mapping[str, Value], axis: str) -> float:
+def _scan_turns(values: Mapping[str, Value], axis: str) -> float:
     """Return how many turns an encoder's calibration leads the motor out, and back."""
     distance = number(values, f"{axis}.encoder.config.calib_scan_distance")
     poles = number(values, f"{axis}.motor.config.pole_pairs")
@@ -173,9 +173,9 @@ def refuse_unfit(
                 f"{axis}.motor.config.calibration_current is {current:g} A; more than 0, and with "
                 f"this current_lim at most {most:g} A are right"
             )
-        if scan_turns(values, axis) > 2.0:
+        if _scan_turns(values, axis) > 2.0:
             faults.append(
-                f"{axis} would be turned by {scan_turns(values, axis):.1f} turns and back: are "
+                f"{axis} would be turned by {_scan_turns(values, axis):.1f} turns and back: are "
                 "motor.config.pole_pairs and encoder.config.calib_scan_distance right?"
             )
     if moves := _await_still(board, pause):
@@ -228,7 +228,7 @@ def calibrate_board(
     return BoardResult(found, why)
 
 
-def zeroed_angles(robot: RobotConfig, module: str, board: Board) -> Pair | None:
+def _zeroed_angles(robot: RobotConfig, module: str, board: Board) -> Pair | None:
     """Return where a board's joint is, (phi, theta), rad; None if it does not know."""
     values = board.read([f"{axis}.encoder.pos_estimate" for axis in AXES])
     if len(values) < len(AXES):
@@ -260,14 +260,14 @@ def _run(
         progress(axis, procedure, passed_s)
         state = board.states()[AXES.index(axis)]
         if state == AxisState.IDLE:
-            return why_failed(board, axis, procedure, passed_s)
+            return _why_failed(board, axis, procedure, passed_s)
         if passed_s > procedure.seconds + OVERTIME_S:
             return (
                 f"it is in state {state} after {passed_s:.0f} s; {procedure.seconds:.0f} are right"
             )
 
 
-def why_failed(board: Board, axis: str, procedure: Procedure, passed_s: float) -> str:
+def _why_failed(board: Board, axis: str, procedure: Procedure, passed_s: float) -> str:
     """Return why an axis that is idle again has failed its calibration; "" if it has not."""
     flag = _READY[0] if procedure.what == "motor" else _READY[1]
     names = [*(f"{axis}.{register}" for register in AXIS_ERRORS), f"{axis}.{flag}"]
@@ -299,7 +299,7 @@ def _mismatch(board: Board, axis: str) -> str:
     if not values.get(name):
         return _STOPPED
     turned = number(values, name) / number(values, f"{axis}.encoder.config.cpr")
-    expected, poles = scan_turns(values, axis), number(values, f"{axis}.motor.config.pole_pairs")
+    expected, poles = _scan_turns(values, axis), number(values, f"{axis}.motor.config.pole_pairs")
     words = f"its encoder counted {turned:.3f} turns where {expected:.3f} are right"
     other = round(expected * poles / turned)
     if other not in (0, poles) and abs(turned * other / (expected * poles) - 1.0) < POLES_WITHIN:
@@ -363,10 +363,10 @@ def refuse_standing(
         board = found.boards.get(robot.module_named(module).serial_number.upper())
         if board is not None:
             states: tuple[int, ...] = board.states()
-            angles = zeroed_angles(robot, module, board)
+            angles = _zeroed_angles(robot, module, board)
             q |= {} if angles is None else {module: angles}
         else:
-            states = can_states(robot, module, run_dir)
+            states = _can_states(robot, module, run_dir)
         if AxisState.CLOSED_LOOP_CONTROL in states:
             raise DriveError(
                 f"the drive of {module} is armed: the robot may stand on it. Hang the robot; "
@@ -380,7 +380,7 @@ def refuse_standing(
             raise DriveError(f"{why}. Hang the robot with its feet clear of the floor")
 
 
-def can_states(robot: RobotConfig, module: str, run_dir: Path) -> tuple[int, ...]:
+def _can_states(robot: RobotConfig, module: str, run_dir: Path) -> tuple[int, ...]:
     """Return the states of a module's axes by their heartbeats on CAN; none if nobody speaks."""
     wiring = robot.module_named(module)
     seconds = can_monitor.long_enough(robot.drive.heartbeat_period_ms)

@@ -174,7 +174,7 @@ def period_ms(times_s: Sequence[float], wanted_ms: float) -> float | None:
     return min((1e3 * median(gaps), 1e3 * fmean(gaps)), key=lambda ms: abs(ms - wanted_ms))
 
 
-def mean_ms(times_s: Sequence[float]) -> float:
+def _mean_ms(times_s: Sequence[float]) -> float:
     """Return the mean period of two frames or more, ms."""
     return 1e3 * (times_s[-1] - times_s[0]) / (len(times_s) - 1)
 
@@ -387,8 +387,8 @@ def _period(
 ) -> Finding:
     module = subject.partition(".")[0]
     measured = period_ms(times_s, wanted_ms)
-    if len(times_s) > 2 and mean_ms(times_s) < TWICE * wanted_ms:
-        measured = mean_ms(times_s)  # two senders: gaps of 1 and 19 ms have a median like one's
+    if len(times_s) > 2 and _mean_ms(times_s) < TWICE * wanted_ms:
+        measured = _mean_ms(times_s)  # two senders: gaps of 1 and 19 ms have a median like one's
     wanted = f"{wanted_ms:g} ms"
     fix = f"config.can.{setting}: `xrl drive configure --apply --module {module}`"
     if measured is None and not times_s:

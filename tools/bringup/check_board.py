@@ -85,7 +85,7 @@ def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values
     rows = []
     fix = f"`xrl drive configure --apply --module {module}`"
     for setting in wanted:
-        subject, name = split_name(module, setting.name)
+        subject, name = _split_name(module, setting.name)
         value = values.get(setting.name)
         words = setting.describe()
         if not isinstance(value, bool | int | float):
@@ -239,7 +239,7 @@ def trip_levels_of(values: Values) -> tuple[float, float]:
     return low, high
 
 
-def split_name(module: str, name: str) -> tuple[str, str]:
+def _split_name(module: str, name: str) -> tuple[str, str]:
     """Return "knee_left.axis0" and the setting's name below it."""
     axis, _, rest = name.partition(".")
     return (f"{module}.{axis}", rest) if axis in AXES else (module, name)
@@ -271,7 +271,7 @@ def _odd_ones(name: str, boards: Boards) -> list[Finding]:
     wanted = f"{usual}, as {count} others"
     why = "a board with other settings behaves differently"
     return [
-        warning(*split_name(module, name), found, wanted, fix, why)
+        warning(*_split_name(module, name), found, wanted, fix, why)
         for module, found in words.items()
         if found != usual
     ]

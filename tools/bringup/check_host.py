@@ -200,7 +200,7 @@ def query_ip() -> Links:
 def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding]:
     """Check every interface that the robot uses, by the file system and by `query_ip`."""
     rows = []
-    for name in interfaces_of(robot):
+    for name in _interfaces_of(robot):
         flags = _text(root / "sys/class/net" / name / "flags")
         if not flags:
             fix = "plug the adapter in; `ip link` lists what is there"
@@ -213,7 +213,7 @@ def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding
     return rows
 
 
-def interfaces_of(robot: RobotConfig) -> list[str]:
+def _interfaces_of(robot: RobotConfig) -> list[str]:
     """Return the interfaces that a robot's buses use."""
     used = [robot.can[name] for name in robot.buses]
     return sorted({bus.channel for bus in used if bus.interface == "socketcan"})

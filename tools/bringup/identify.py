@@ -89,7 +89,7 @@ class Tone(NamedTuple):
         )
 
 
-class Tones(NamedTuple):
+class _Tones(NamedTuple):
     """Tones one after the other (`tools.bringup.motion.AxisCourse`)."""
 
     tones: tuple[Tone, ...]
@@ -126,7 +126,7 @@ class Tones(NamedTuple):
         return found
 
 
-SinePlan = MotionPlan[Tones]
+SinePlan = MotionPlan[_Tones]
 
 
 class JointFit(NamedTuple):
@@ -157,7 +157,7 @@ def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> 
     k_d = min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1])
     # alike for both axes: both motors' own loops then do all of it
     soft = ((k_p, k_p), (k_d, k_d))
-    return SinePlan(axis, Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
+    return SinePlan(axis, _Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
 
 
 def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:

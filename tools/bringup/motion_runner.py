@@ -136,7 +136,7 @@ def await_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading | None:
     return reading
 
 
-def idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
+def _idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
     """Return the first reading of an idle drive that is zeroed."""
     reading = await_reading(drive, clock)
     if reading is None:
@@ -163,7 +163,7 @@ def hanging_angles(
         q = {}
         for name, drive in drives.items():
             try:
-                reading = idle_reading(drive, clock)
+                reading = _idle_reading(drive, clock)
             except DriveError as error:
                 raise DriveError(f"{name}: {error}") from None
             phi, theta = q[name] = joint_from_motor(reading.pos_turns, robot.joint.gear_ratio)

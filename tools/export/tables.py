@@ -45,7 +45,7 @@ Reader: TypeAlias = Callable[[Any], Any]
 """Returns a column's value in a message: an int, a float, a bool or a str."""
 
 
-class CsvFile:
+class _CsvFile:
     """A CSV file."""
 
     def __init__(self, path: Path, columns: Iterable[str]) -> None:
@@ -99,7 +99,7 @@ def write_tables(
     `done` takes the s that are written.
     """
     zero = zero_ns(index)
-    open_files: dict[str, CsvFile] = {}
+    open_files: dict[str, _CsvFile] = {}
     rows: dict[str, int] = {}
     readers = {key.topic: columns_of(key.topic.type) for key in keys}
     with contextlib.ExitStack() as stack:
@@ -111,7 +111,7 @@ def write_tables(
                 getters = readers[key.topic]
                 name = key.name.replace("/", ".")
                 if name not in open_files:
-                    file = CsvFile(folder / f"{name}.csv", (TIME, *getters))
+                    file = _CsvFile(folder / f"{name}.csv", (TIME, *getters))
                     open_files[name] = stack.enter_context(contextlib.closing(file))
                 times = [(at_ns - zero) / NS_PER_S for at_ns, _ in held]
                 cells = {
@@ -141,7 +141,7 @@ def write_grid(
     readers = {key.topic: columns_of(key.topic.type) for key in steady}
     names = [f"{key.name}.{name}" for key in steady for name in readers[key.topic]]
     zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
-    with contextlib.closing(CsvFile(path, (TIME, *names))) as file:
+    with contextlib.closing(_CsvFile(path, (TIME, *names))) as file:
         for log in parts_of(index, part, done=done):
             first = math.ceil((log.begin_ns - zero) / step_ns)
             last = math.ceil((log.end_ns - zero) / step_ns)

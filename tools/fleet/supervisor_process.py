@@ -39,7 +39,7 @@ NEWEST_MAX: Final = 300
 """Bytes of a log's newest line that are kept."""
 
 
-class LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no types
+class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no types
     """A log that rotates, comes back after its folder was removed, and never raises."""
 
     lost = 0
@@ -64,11 +64,11 @@ class LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no types
         text = message if isinstance(message, bytes) else (self.fmt % record.asdict()).encode()
         if words := text.strip():
             newest = words.rpartition(b"\n")[2][:NEWEST_MAX]
-            LogFile.newest[self.baseFilename] = newest.decode(errors="replace")
+            _LogFile.newest[self.baseFilename] = newest.decode(errors="replace")
         try:
             self._open()
             if self._missing:
-                self._write(f"({self._missing} lines are missing: {LogFile.why})\n".encode())
+                self._write(f"({self._missing} lines are missing: {_LogFile.why})\n".encode())
                 self._missing = 0
             self._write(text)
             if 0 < self._max_bytes <= Path(self.baseFilename).stat().st_size:
@@ -76,7 +76,7 @@ class LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no types
         except OSError as error:
             self.close()
             self._missing += 1
-            LogFile.lost, LogFile.why = LogFile.lost + 1, error.strerror or str(error)
+            _LogFile.lost, _LogFile.why = _LogFile.lost + 1, error.strerror or str(error)
 
     def flush(self) -> None:
         """Do nothing: nothing is buffered."""
@@ -152,7 +152,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
             "starts": self.starts,
             "ends_lately": sum(time.monotonic() - end_s < LATELY_S for end_s in self._ends_s),
             "last_exit": self.last_exit or self.spawnerr or "",
-            "last_line": LogFile.newest.get(self.config.stdout_logfile, ""),
+            "last_line": _LogFile.newest.get(self.config.stdout_logfile, ""),
         }
 
 
@@ -169,7 +169,7 @@ class _FleetInterface:
 
     def logs(self) -> dict[str, Any]:
         """Return how many log lines were lost, and why the newest was."""
-        return {"lost": LogFile.lost, "why": LogFile.why}
+        return {"lost": _LogFile.lost, "why": _LogFile.why}
 
 
 def make_interface(supervisor: Any, **_settings: str) -> _FleetInterface:
@@ -205,7 +205,7 @@ def main() -> None:
     if args.parent is not None:
         die_with_parent(args.parent, signal.SIGTERM)
         _Options.leashed = True
-    loggers.RotatingFileHandler = LogFile
+    loggers.RotatingFileHandler = _LogFile
     process.Subprocess = Service
     supervisord.ServerOptions = _Options
     # As `run_dir.one_line` writes it: a value is what stands there, whatever characters it has.

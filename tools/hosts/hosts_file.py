@@ -85,10 +85,10 @@ def load(path: Path, robot: RobotConfig) -> Hosts:
 
 def _problems(hosts: Hosts, robot: RobotConfig) -> Problems:
     for index, host in enumerate(hosts.host):
-        for key, found, right in _of_host(host, hosts.host[:index], real_services(robot)):
+        for key, found, right in _of_host(host, hosts.host[:index], _real_services(robot)):
             yield f"host[{index}].{key}", found, right
     homes = {service: host.name for host in hosts.host for service in host.services}
-    absent = [service for service in real_services(robot) if service not in homes]
+    absent = [service for service in _real_services(robot) if service not in homes]
     if absent:
         yield "host", f"{', '.join(absent)} runs nowhere", "each on one host"
     for side in SIDES:
@@ -138,7 +138,7 @@ def _of_address(key: str, text: str) -> Problems:
         yield key, f"{text!r}", "the address of one host"
 
 
-def real_services(robot: RobotConfig) -> tuple[str, ...]:
+def _real_services(robot: RobotConfig) -> tuple[str, ...]:
     """Return what runs on a real robot's hosts."""
     return tuple(service for service in robot.services if service != "simulator")
 

@@ -27,7 +27,7 @@ class Said(NamedTuple):
     error: str
 
 
-class Manner(TypedDict, total=False):
+class _Manner(TypedDict, total=False):
     """How a command runs on a host."""
 
     content: bytes
@@ -46,7 +46,7 @@ class Remote:
         # from a folder that every user may enter: find and others go back to where they began
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
-    def run(self, *words: str, **manner: Unpack[Manner]) -> Said:
+    def run(self, *words: str, **manner: Unpack[_Manner]) -> Said:
         """Run a command, which no shell takes apart, and wait for it; how it ends is no error.
 
         Raises:
@@ -72,7 +72,7 @@ class Remote:
             raise FleetError(f"{name}: {text}")
         return Said(done.returncode, out, errors)
 
-    def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[Manner]) -> None:
+    def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[_Manner]) -> None:
         """Run a command, and hand on each line as it prints it.
 
         Raises:
@@ -95,12 +95,12 @@ class Remote:
         if process.returncode != 0:
             raise FleetError(f"{name}: {_last(errors)}")
 
-    def _command(self, words: Sequence[str], manner: Manner) -> list[str]:
+    def _command(self, words: Sequence[str], manner: _Manner) -> list[str]:
         """Return what this computer runs to have a host run words; they print after `MARK`."""
         before = self._as_user if manner.get("as_user") else []
         return [*self._begin, f"echo {MARK}; {shlex.join([*before, *words])}"]
 
-    def must(self, *words: str, **manner: Unpack[Manner]) -> str:
+    def must(self, *words: str, **manner: Unpack[_Manner]) -> str:
         """Run a command that has to succeed, and return what it printed."""
         said = self.run(*words, **manner)
         if said.code != 0:

@@ -94,7 +94,7 @@ def _refused(text: str, form: str, **known: Iterable[str]) -> argparse.ArgumentT
     return argparse.ArgumentTypeError(f"{text!r}; write {form}{names}")
 
 
-def parse_kill(text: str) -> Kill:
+def _parse_kill(text: str) -> Kill:
     """Read SERVICE@T[:SIGNAL]."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})(?::(?:SIG)?(\w+))?", text)
     if match is None or match[1] not in SERVICES or (match[3] or "KILL") not in SIGNALS:
@@ -109,7 +109,7 @@ def parse_kill(text: str) -> Kill:
     return msgspec.convert(row, Kill)
 
 
-def parse_restart(text: str) -> Restart:
+def _parse_restart(text: str) -> Restart:
     """Read SERVICE@T."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})", text)
     if match is None or match[1] not in SERVICES:
@@ -117,7 +117,7 @@ def parse_restart(text: str) -> Restart:
     return Restart(service=match[1], at=float(match[2]))
 
 
-def parse_push(text: str) -> Push:
+def _parse_push(text: str) -> Push:
     """Read T:DUR:FX,FY,FZ."""
     signed = rf"(-?{_NUMBER})"
     match = re.fullmatch(rf"({_NUMBER}):({_NUMBER}):{signed},{signed},{signed}", text)
@@ -160,15 +160,15 @@ class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
     kill: Annotated[
         tuple[Kill, ...] | None,
         parsed(
-            parse_kill,
+            _parse_kill,
             "SERVICE@T[:SIGNAL]",
             help=f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
             "replaces the scenario's kills; may be repeated",
         ),
     ] = None
-    restart: Annotated[tuple[Restart, ...] | None, parsed(parse_restart, "SERVICE@T")] = None
+    restart: Annotated[tuple[Restart, ...] | None, parsed(_parse_restart, "SERVICE@T")] = None
     """start a killed service again, or continue a stopped one; may be repeated"""
-    push: Annotated[tuple[Push, ...] | None, parsed(parse_push, "T:DUR:FX,FY,FZ")] = None
+    push: Annotated[tuple[Push, ...] | None, parsed(_parse_push, "T:DUR:FX,FY,FZ")] = None
     """push the torso by a force in N from T for DUR s; replaces the scenario's pushes; may be
     repeated"""
     fault: Annotated[

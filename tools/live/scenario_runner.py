@@ -89,7 +89,7 @@ class TriggeredKill(NamedTuple):
     """since so long."""
 
 
-class CpuMeter:
+class _CpuMeter:
     """CPU time of the fleet and of this process, summed over processes that come and go."""
 
     def __init__(self) -> None:
@@ -226,7 +226,7 @@ class ScenarioRunner:
         ]  # fmt: skip
         todo.sort(key=lambda row: row.at)
         fallen_at_s, ended_at_s = math.inf, rows.duration
-        meter = CpuMeter()
+        meter = _CpuMeter()
         while True:
             self._listen()
             self._sample_processes(meter)
@@ -256,7 +256,7 @@ class ScenarioRunner:
         self._events.say(RunEventKind.FINISHED, self._scenario.name, detail)
         time.sleep(LAST_WORDS_S)
 
-    def _sample_processes(self, meter: CpuMeter) -> None:
+    def _sample_processes(self, meter: _CpuMeter) -> None:
         """Once a second: a kill must not wait for the supervisor to tell the process."""
         now_s = time.monotonic()
         if now_s >= self._next_pids_s:

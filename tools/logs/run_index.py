@@ -69,14 +69,14 @@ def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
 
 def files_in(directory: Path) -> list[Path]:
     """Return the files of the one run in a directory, in order."""
-    runs = runs_in(directory)
+    runs = _runs_in(directory)
     if len(runs) > 1:
         first = ", ".join(run[0].name for run in runs)
         raise RunError(f"{directory}: holds {len(runs)} runs ({first}); give the files of one")
     return runs[0]
 
 
-def runs_in(directory: Path) -> list[list[Path]]:
+def _runs_in(directory: Path) -> list[list[Path]]:
     """Return the files of each run in a directory: a recorder that restarts begins one."""
     names = _names(directory)
     plain = [path for path in names if "." not in path.stem]  # not recovered or executed again
@@ -103,7 +103,7 @@ def _number(metadata: MetadataByName) -> int:
     return int(text) if text.isdecimal() and text.isascii() and len(text) < 10 else 0
 
 
-class RecordedFile:
+class _RecordedFile:
     """A file, skimmed."""
 
     def __init__(self, path: Path) -> None:
@@ -213,7 +213,7 @@ class RunIndex:
         self.path = path
         self.files = list(files) or (files_in(path) if path.is_dir() else [path])
         """The files of the run, in order: several if it was split."""
-        self._files = [RecordedFile(file) for file in self.files]
+        self._files = [_RecordedFile(file) for file in self.files]
         first = self._files[0]
         version = first.required("run", "schema_version")
         if version != SCHEMA_VERSION:

@@ -101,7 +101,7 @@ class RunLog:
     always of the whole run: a mode or a cut link that began before a part holds in it.
 
     Where the services ran on several hosts, `t_ns` of a message from another host than the
-    recorder's is brought to the recorder's clock (`on_recorders_clock`), so that times can be
+    recorder's is brought to the recorder's clock (`_on_recorders_clock`), so that times can be
     compared. With `as_sent` it is what the message says, as re-execution needs it. Other times in a
     message stay its sender's.
     """
@@ -223,7 +223,7 @@ class RunLog:
             return messages
         if self._hosts.get(sender_of(topic, module)) == here:
             return messages
-        times_ns = on_recorders_clock([message.t_ns for message in messages], received_ns)
+        times_ns = _on_recorders_clock([message.t_ns for message in messages], received_ns)
         return [
             msgspec.structs.replace(message, t_ns=t_ns)
             for message, t_ns in zip(messages, times_ns, strict=True)
@@ -275,7 +275,7 @@ class RunLog:
                     series.seq.append(seq)
 
 
-def on_recorders_clock(sent_ns: Sequence[int], received_ns: Sequence[int]) -> list[int]:
+def _on_recorders_clock(sent_ns: Sequence[int], received_ns: Sequence[int]) -> list[int]:
     """Return the times of one sender's messages on the clock of the recorder that received them.
 
     A monotonic clock counts from its host's start, so two of them are hours apart. The fastest

@@ -40,7 +40,7 @@ from shared.robot.trip_table import untripped
 from tools.sim.lockstep import Lockstep
 
 
-class LeadsOn(Engagement):
+class _LeadsOn(Engagement):
     """Engages as shipped, and then leads with any states: no tier below it could hold."""
 
     def advance(
@@ -57,13 +57,13 @@ class LeadsOn(Engagement):
         return super().advance(now_ns, fresh, ready, modes, inhibit)
 
 
-class CentralPlanner(Planner):
+class _CentralPlanner(Planner):
     """The shipped planner, whose commands are whole torques."""
 
     def __init__(self, config: RobotConfig, session: int) -> None:
         """Take the robot and the session, as the shipped planner does."""
         super().__init__(config, session)
-        self.state.engagement = LeadsOn()
+        self.state.engagement = _LeadsOn()
 
     def tick(self, now_ns: int) -> list[JointCommand]:
         """Run the law; return six commands, `tau_ff` of which is all of a joint's torque."""
@@ -92,7 +92,7 @@ def _whole(command: JointCommand, state: JointState) -> JointCommand:
     )
 
 
-class PassThrough(DriveManager):
+class _PassThrough(DriveManager):
     """A joint module that passes torques on.
 
     It comes up as the shipped one, from the hoist through HOLD into TRACK. From the end of that
@@ -151,8 +151,8 @@ def torques_only(config: RobotConfig) -> RobotConfig:
 class CentralisedLockstep(Lockstep):
     """A whole fleet in virtual time, each torque computed by the planner."""
 
-    planner_type = CentralPlanner
-    module_type = PassThrough
+    planner_type = _CentralPlanner
+    module_type = _PassThrough
 
     def __init__(self, config: RobotConfig, *args: Any, **how: Any) -> None:
         """Put the robot on the hoist; arguments as for `Lockstep`."""

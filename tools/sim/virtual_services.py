@@ -73,7 +73,7 @@ class VirtualTime:
         return lambda: clock.read(self.now_ns)
 
 
-class LinkInbox(Generic[M]):
+class _LinkInbox(Generic[M]):
     """The receiving end of a link: an `Inbox`."""
 
     refused = 0
@@ -86,7 +86,7 @@ class LinkInbox(Generic[M]):
         return self._link.take(self._time.now_ns)
 
 
-class RecordOutbox(Generic[M]):
+class _RecordOutbox(Generic[M]):
     """The sending end of a link, if anybody listens, and of the record: an `Outbox`."""
 
     def __init__(
@@ -131,7 +131,7 @@ class SharedMemory:
         self.planner = session
 
 
-class Neighbourhood:
+class _Neighbourhood:
     """One module's place in the shared memory: other modules, stops, the planner's end."""
 
     def __init__(
@@ -203,14 +203,14 @@ class VirtualJoint:
         )
         frame = MotorFrame(config.drive.zero_mark_turns, config.module_named(name).motor_signs)
         self._wired = WiredDrive(self.drive, frame)
-        self._place = Neighbourhood(memory, index, time, self._clock)
+        self._place = _Neighbourhood(memory, index, time, self._clock)
         links = network.links
         self._ports = JointPorts(
-            commands=LinkInbox(links[f"planner->{name}"], time),
+            commands=_LinkInbox(links[f"planner->{name}"], time),
             estops=self._place,
-            states=RecordOutbox(record, topics.JOINT_STATE, name, links[f"{name}->planner"], time),
-            events=RecordOutbox(record, topics.JOINT_EVENT, name),
-            traces=RecordOutbox(record, topics.JOINT_TRACE, name) if traced else None,
+            states=_RecordOutbox(record, topics.JOINT_STATE, name, links[f"{name}->planner"], time),
+            events=_RecordOutbox(record, topics.JOINT_EVENT, name),
+            traces=_RecordOutbox(record, topics.JOINT_TRACE, name) if traced else None,
             planner=self._place,
         )
         self._start(make())
@@ -294,17 +294,17 @@ class VirtualPlanner:
         self._config, self._make, self._clock = config, make, time.on(clock)
         self._memory = beside
         links = network.links
-        checkpoints = RecordOutbox[PlannerCheckpoint](record, topics.PLANNER_CHECKPOINT)
+        checkpoints = _RecordOutbox[PlannerCheckpoint](record, topics.PLANNER_CHECKPOINT)
         self._ports = PlannerPorts(
-            states=[LinkInbox(links[f"{name}->planner"], time) for name in MODULES],
-            wrench=LinkInbox(links[WRENCHES], time),
-            attitude=LinkInbox(links[ATTITUDES], time),
+            states=[_LinkInbox(links[f"{name}->planner"], time) for name in MODULES],
+            wrench=_LinkInbox(links[WRENCHES], time),
+            attitude=_LinkInbox(links[ATTITUDES], time),
             request=lambda _host_ns: request(),
             commands=[
-                RecordOutbox(record, topics.JOINT_COMMAND, name, links[f"planner->{name}"], time)
+                _RecordOutbox(record, topics.JOINT_COMMAND, name, links[f"planner->{name}"], time)
                 for name in MODULES
             ],
-            status=RecordOutbox(record, topics.PLANNER_STATUS),
+            status=_RecordOutbox(record, topics.PLANNER_STATUS),
             checkpoint=checkpoints if traced else None,
             announce=None if beside is None else beside.announce,
         )
@@ -392,7 +392,7 @@ class VirtualHarness:
         time: VirtualTime,
         clock: HostClock,
     ) -> None:
-        wrenches = RecordOutbox(record, topics.WRENCH, "", network.links[WRENCHES], time)
+        wrenches = _RecordOutbox(record, topics.WRENCH, "", network.links[WRENCHES], time)
         self._loop = HarnessLoop(cells, WrenchFilter(config.harness), wrenches, self)
         self._robot, self._time, self._clock = robot, time, time.on(clock)
         self._request: TareRequest | None = None
@@ -432,7 +432,7 @@ class VirtualImu:
         clock: HostClock,
     ) -> None:
         self._robot, self._time, self._clock = robot, time, time.on(clock)
-        attitudes = RecordOutbox(record, topics.ATTITUDE, "", network.links[ATTITUDES], time)
+        attitudes = _RecordOutbox(record, topics.ATTITUDE, "", network.links[ATTITUDES], time)
         self._loop = ImuLoop(frames, AttitudeLaw(config.imu), attitudes)
 
     def advance(self) -> None:

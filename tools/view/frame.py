@@ -326,7 +326,7 @@ class ShownBody(msgspec.Struct, frozen=True):
     """Of its centre."""
 
 
-def bodies_of(robot: RobotConfig) -> tuple[ShownBody, ...]:
+def _bodies_of(robot: RobotConfig) -> tuple[ShownBody, ...]:
     """Return the torso, and on each leg thigh, shin and sole."""
     geometry = robot.geometry
     found = [ShownBody("torso", "cube", geometry.torso_size)]
@@ -391,7 +391,7 @@ def model_of(robot: RobotConfig, kind: str, title: str) -> Model:
         modules=MODULES,
         modes={int(mode): mode.name for mode in Mode},
         joints={name: (still[name].parent, still[name].position) for name in MODULES},
-        bodies=bodies_of(robot),
+        bodies=_bodies_of(robot),
         harness=geometry.harness_point,
         foot=(geometry.l_foot, geometry.w_foot, geometry.foot_height),
     )

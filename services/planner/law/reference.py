@@ -29,7 +29,7 @@ STEPS_MAX: Final = 3
 """Steps by the graph; near a solution each squares the error. What needs more is not near."""
 
 
-class ReferenceInputs(msgspec.Struct, frozen=True):
+class _ReferenceInputs(msgspec.Struct, frozen=True):
     """Arguments of the graph, in its order: `Reference` writes all arrays but `stance`."""
 
     q: Array
@@ -72,7 +72,7 @@ class Reference:
         limits = np.array(config.joint_limits())
         self._ik = InverseKinematics(Kinematics(config), limits)
         self._graph = CompiledGraph(graphs_of(config).reference)
-        self.inputs = ReferenceInputs(*self._graph.arguments)
+        self.inputs = _ReferenceInputs(*self._graph.arguments)
         self.inputs.low[:], self.inputs.high[:] = limits.T
         (
             self._q_next, self._check, self.T, self.v, self.p, self.J, self.J_harness,
@@ -85,7 +85,7 @@ class Reference:
     ) -> None:
         """Set what the next `solve` or `evaluate` uses besides the pose.
 
-        The arguments are as in `ReferenceInputs`; `pdot_ref` in m/s and rad/s.
+        The arguments are as in `_ReferenceInputs`; `pdot_ref` in m/s and rad/s.
         """
         inputs = self.inputs
         inputs.pdot_ref[:], inputs.F_O[:] = pdot_ref, F_O

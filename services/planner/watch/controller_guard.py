@@ -89,7 +89,7 @@ class ControllerGuard:
             if not leads:
                 return self._rested(state, seen)
             action = self._controller.step(shown)
-            fault = fault_of(action)
+            fault = _fault_of(action)
         except Exception as error:  # noqa: BLE001 - whatever somebody's code brings about
             fault = f"raised {type(error).__name__}: {error}"
         if fault:
@@ -142,7 +142,7 @@ class ControllerGuard:
         return ""
 
 
-def fault_of(action: object) -> str:
+def _fault_of(action: object) -> str:
     """Return what is wrong with what a controller returned; "" if it is an action."""
     if not isinstance(action, Action):
         return f"returned a {type(action).__name__}; an Action is right"

@@ -63,12 +63,12 @@ _SETTINGS: Final = (
 
 
 _ROWS: Final = 5
-"""Rows of the current loops' state: see `LawResults.loops`."""
+"""Rows of the current loops' state: see `_LawResults.loops`."""
 _POWER: Final = 4 * N_JOINTS
 """Where its last row begins."""
 
 
-class LawResults(NamedTuple):
+class _LawResults(NamedTuple):
     """What the law computes in a step; arrays (12,) but for the last."""
 
     torque: Vector
@@ -126,7 +126,7 @@ class AxisControl:
         for index, array in enumerate((*columns, *live)):
             graph.bind(index, array)
         self._step = graph.arguments[-1]
-        self.results = LawResults(*graph.results)
+        self.results = _LawResults(*graph.results)
 
     def regulates(self) -> bool:
         """Return True if any axis in closed loop has a position or velocity loop."""
@@ -193,7 +193,7 @@ class AxisControl:
 
 @functools.cache
 def law_graph() -> ca.Function:
-    """Return the law: settings, estimates, inputs and state of twelve axes -> `LawResults`."""
+    """Return the law: settings, estimates, inputs and state of twelve axes -> `_LawResults`."""
     names = [name.rpartition(".")[2] for name in _SETTINGS]
     inputs = (
         "pos", "vel", "input_pos", "input_vel", "input_torque", "armed", "connected", "derating",

@@ -187,7 +187,7 @@ def _sdo(bank: AxisBank, axis: int, data: bytes) -> bytes | None:
     drive = axis >> 1
     if opcode == SdoOpcode.WRITE and name not in _READINGS:
         full = _full(name, axis)
-        layout = sdo_layout(bank.settings.get(drive, full))
+        layout = _sdo_layout(bank.settings.get(drive, full))
         number: Value = struct.unpack_from(layout, value.ljust(4, b"\0"))[0]
         try:
             bank.settings.set(drive, full, number)
@@ -199,7 +199,7 @@ def _sdo(bank: AxisBank, axis: int, data: bytes) -> bytes | None:
         reading: Value = bank.bus.state(drive)[_READINGS.index(name)]
     else:
         reading = bank.settings.get(drive, _full(name, axis))
-    layout = sdo_layout(reading)
+    layout = _sdo_layout(reading)
     return cansimple_06.pack_sdo(0, endpoint, struct.pack(layout, reading).ljust(4, b"\0"))
 
 
@@ -213,7 +213,7 @@ def _full(name: str, axis: int) -> str:
     return name if name in DRIVE_SETTINGS else f"axis{axis & 1}.{name}"
 
 
-def sdo_layout(value: Value) -> str:
+def _sdo_layout(value: Value) -> str:
     """Return the `struct` layout of an endpoint with such a value."""
     if isinstance(value, bool):
         return "<?"

@@ -37,7 +37,7 @@ class Torso(NamedTuple):
     """Centre of mass (3,), m, torso axes; a plant may move it."""
 
 
-class Hoist(msgspec.Struct):
+class _Hoist(msgspec.Struct):
     """A spring-damper on the torso that also carries weight, by a share that is let down."""
 
     weight: float
@@ -98,7 +98,7 @@ class OutsideForces:
         self._harness_point = body.harness_point
         self.operator = Operator(body.hand, body.harness_point)
         self.wearer = Wearer(body.plant.person)
-        self.hoist = Hoist(body.weight, body.hoist_s, torso.position.copy())
+        self.hoist = _Hoist(body.weight, body.hoist_s, torso.position.copy())
         self.asked: tuple[float, Vector4] | None = None
         self.led_hand: LedHand | None = None
         self.holds = scenario.hand

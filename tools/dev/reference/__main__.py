@@ -59,7 +59,7 @@ bus or in a file's name are printed escaped, such as `\\u001b`.
 """
 
 
-def faults_page() -> Iterator[str]:
+def _faults_page() -> Iterator[str]:
     """Yield the page of faults: what happens, and what a person does."""
     yield _FAULTS
     for title, about, headings, rows in fault_sections(load(DEFAULT_CONFIG).trips):
@@ -69,7 +69,7 @@ def faults_page() -> Iterator[str]:
         yield ""
 
 
-def modes_page() -> Iterator[str]:
+def _modes_page() -> Iterator[str]:
     """Yield the page of the joint service's state machine."""
     docs = cell_docs(Event)
     rows = []
@@ -88,7 +88,7 @@ def _after(mode: Mode, event: Event) -> str:
     return row[0].name if row else ""
 
 
-def verbs_page() -> Iterator[str]:
+def _verbs_page() -> Iterator[str]:
     """Yield the page of the command line: each verb's own help."""
     with mock.patch.dict(os.environ, COLUMNS=_WIDTH):  # argparse wraps by it
         helps = list(_helps(whole_parser()))
@@ -112,9 +112,9 @@ def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
 PAGES: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "topics.md": topics.page,
     "robot-file.md": robot_file.page,
-    "verbs.md": verbs_page,
-    "faults.md": faults_page,
-    "modes.md": modes_page,
+    "verbs.md": _verbs_page,
+    "faults.md": _faults_page,
+    "modes.md": _modes_page,
 }
 """Lines of the generated files, by name."""
 

@@ -53,7 +53,7 @@ MESSAGE: Final = struct.Struct("q440x")
 """The time at which it was put; as long as the fleet's states and commands."""
 
 
-def over_zenoh(process: str, folder: Path) -> End:
+def _over_zenoh(process: str, folder: Path) -> End:
     """Join the fleet's own bus: peers, fixed endpoints, one ring of depth 1 for each key."""
     session = open_session(config_file.load(DEFAULT_CONFIG), process, folder)
 
@@ -92,7 +92,7 @@ def over_datagrams(_process: str, folder: Path) -> End:
     return publisher, latest
 
 
-def over_zmq(_process: str, folder: Path) -> End:
+def _over_zmq(_process: str, folder: Path) -> End:
     """Join ZeroMQ: PUB and SUB over ipc, a socket for each key; CONFLATE keeps the newest."""
     context = zmq.Context()
 
@@ -111,7 +111,7 @@ def over_zmq(_process: str, folder: Path) -> End:
     return publisher, latest
 
 
-def over_iceoryx2(_process: str, folder: Path) -> End:
+def _over_iceoryx2(_process: str, folder: Path) -> End:
     """Join iceoryx2: for each key bytes in shared memory, with a buffer of one sample."""
     iox2.set_log_level(iox2.LogLevel.Fatal)
     node = iox2.NodeBuilder.new().create(iox2.ServiceType.Ipc)
@@ -147,7 +147,7 @@ def over_iceoryx2(_process: str, folder: Path) -> End:
     return publisher, latest
 
 
-def over_cyclonedds(_process: str, folder: Path) -> End:
+def _over_cyclonedds(_process: str, folder: Path) -> End:
     """Join a DDS domain of the folder's own: best effort, keep last 1, UDP on the loopback."""
     os.environ["CYCLONEDDS_URI"] = (
         "<CycloneDDS><Domain><General><Interfaces>"
@@ -180,11 +180,11 @@ def over_cyclonedds(_process: str, folder: Path) -> End:
 
 
 TRANSPORTS: Final = {
-    "zenoh": (over_zenoh, "zenoh"),
+    "zenoh": (_over_zenoh, "zenoh"),
     "datagrams": (over_datagrams, "socket"),
-    "zmq": (over_zmq, "zmq"),
-    "iceoryx2": (over_iceoryx2, "iceoryx2"),
-    "cyclonedds": (over_cyclonedds, "cyclonedds"),
+    "zmq": (_over_zmq, "zmq"),
+    "iceoryx2": (_over_iceoryx2, "iceoryx2"),
+    "cyclonedds": (_over_cyclonedds, "cyclonedds"),
 }
 """How a process joins, and the package that it needs."""
 
@@ -194,7 +194,7 @@ Seen = tuple[list[float], int, float]
 commands that a cycle missed which could have taken them, and CPU time as a fraction of a core."""
 
 
-def run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[float], int]:
+def _run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[float], int]:
     """Put a state in every other cycle, take the newest command in each; count from `begin_ns`."""
     put, take = end[0](f"state_{name}"), end[1](f"command_{name}")
     latencies, missed = list[float](), 0
@@ -214,7 +214,7 @@ def run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[fl
     return latencies, missed
 
 
-def run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[float], int]:
+def _run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[float], int]:
     """Put six commands once six new states are there."""
     takes = [end[1](f"state_{module}") for module in MODULES]
     puts = [end[0](f"command_{module}") for module in MODULES]
@@ -238,11 +238,11 @@ def measure(transport: str, seconds: float) -> dict[str, float]:
         tempfile.TemporaryDirectory(prefix="xrl-bus-") as folder,
         ProcessPoolExecutor(len(names), multiprocessing.get_context("spawn")) as pool,
     ):
-        running = [pool.submit(run_process, transport, folder, name, seconds) for name in names]
+        running = [pool.submit(_run_process, transport, folder, name, seconds) for name in names]
         return figures(transport, [one.result() for one in running])
 
 
-def run_process(transport: str, folder: str, name: str, seconds: float) -> Seen:
+def _run_process(transport: str, folder: str, name: str, seconds: float) -> Seen:
     """Run one process of the pattern, and return what it saw."""
     scheduling.raise_priority(20)
     end = TRANSPORTS[transport][0](name, Path(folder))
@@ -251,7 +251,7 @@ def run_process(transport: str, folder: str, name: str, seconds: float) -> Seen:
     begin_ns, cpu_ns = time.monotonic_ns(), time.process_time_ns()
     counted_ns = begin_ns + round(WARM_UP_S * NS_PER_S)
     end_ns = counted_ns + round(seconds * NS_PER_S)
-    found = (run_planner if name == PLANNER else run_module)(end, name, counted_ns, end_ns)
+    found = (_run_planner if name == PLANNER else _run_module)(end, name, counted_ns, end_ns)
     return *found, (time.process_time_ns() - cpu_ns) / (time.monotonic_ns() - begin_ns)
 
 

@@ -147,7 +147,7 @@ class _KeptManager(DriveManager):
         return action
 
 
-def planner_tick(recorded: Recorded, _stack: ExitStack, split: str = "certified") -> Repeated:
+def _planner_tick(recorded: Recorded, _stack: ExitStack, split: str = "certified") -> Repeated:
     """Six states in, six commands and a status out; the hand leads."""
     law = msgspec.structs.replace(recorded.robot.law, split=split)
     planner = Planner(msgspec.structs.replace(recorded.robot, law=law), session=1)
@@ -168,7 +168,7 @@ def planner_tick(recorded: Recorded, _stack: ExitStack, split: str = "certified"
     return Repeated(once)
 
 
-def joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
+def _joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
     """A command's JSON and a sample in, a target and every other cycle a state's JSON out."""
     manager, decoder = DriveManager(recorded.robot, MODULE), Decoder(JointCommand)
     arguments = [one.arguments for one in recorded.cycles]
@@ -186,7 +186,7 @@ def joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
     return Repeated(once)
 
 
-def drive_exchange(recorded: Recorded, stack: ExitStack) -> Repeated:
+def _drive_exchange(recorded: Recorded, stack: ExitStack) -> Repeated:
     """Both axes' encoder frames in, the frames of a target out, over the simulator's CAN bus."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrl-bench-")))
     hub = stack.enter_context(UnixCanHub(folder / "can"))
@@ -210,7 +210,7 @@ def drive_exchange(recorded: Recorded, stack: ExitStack) -> Repeated:
     return Repeated(once, before)
 
 
-def simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
+def _simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
     """One step of the world with its twelve emulated axes, without frames and bus."""
     world, bank = recorded.fleet.world, recorded.fleet.bank
 
@@ -220,7 +220,7 @@ def simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
     return Repeated(once)
 
 
-def recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
+def _recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
     """`BATCH` messages from the bus to the file."""
     writer = _writer(recorded.robot, stack)
     outbox, messages = RecordedMessages(recorded.robot.name), itertools.cycle(recorded.messages)
@@ -259,12 +259,12 @@ class Part(NamedTuple):
 
 
 PARTS: Final = (
-    Part("planner tick", planner_tick, warm_us=110.0, cold_us=300.0),
-    Part("tick, the paper's split", functools.partial(planner_tick, split="diagonal")),
-    Part("joint cycle", joint_cycle),
-    Part("joint's drive over CAN", drive_exchange),
-    Part("simulator step", simulator_step),
-    Part(f"recorder, {BATCH} messages", recorder_batch),
+    Part("planner tick", _planner_tick, warm_us=110.0, cold_us=300.0),
+    Part("tick, the paper's split", functools.partial(_planner_tick, split="diagonal")),
+    Part("joint cycle", _joint_cycle),
+    Part("joint's drive over CAN", _drive_exchange),
+    Part("simulator step", _simulator_step),
+    Part(f"recorder, {BATCH} messages", _recorder_batch),
     Part("yardstick", yardstick),
 )
 
@@ -293,7 +293,7 @@ class Bench:
     def turn(self) -> Turn:
         """Return each part's cost, us, and the speeds of lockstep, times real time."""
         found: Turn = {
-            name: lockstep_speed(self._robot, self._squat, self._writer if record else None)
+            name: _lockstep_speed(self._robot, self._squat, self._writer if record else None)
             for name, record in zip(LOCKSTEP, (False, True), strict=True)
         }
         for name, part in self._parts.items():
@@ -302,7 +302,7 @@ class Bench:
         return found
 
 
-def lockstep_speed(robot: RobotConfig, scenario: Scenario, writer: RunWriter | None) -> float:
+def _lockstep_speed(robot: RobotConfig, scenario: Scenario, writer: RunWriter | None) -> float:
     """Return how many times faster than real time one core runs the scenario's first `PIECE_S`.
 
     To stand up is not measured. With a writer the run is recorded.

@@ -132,12 +132,12 @@ def run_turns(
     if flags.against is None:
         return [measure() for _ in each], []
     with unpacked(flags.against) as other:
-        pairs = [(turn_of(CHECKOUT, words, flags.config), turn_of(other, words, flags.config))
+        pairs = [(_turn_of(CHECKOUT, words, flags.config), _turn_of(other, words, flags.config))
                  for _ in each]  # fmt: skip
     return [here for here, _ in pairs], [there for _, there in pairs]
 
 
-def turn_of(tree: Path, words: Sequence[str], config: Path) -> Turn:
+def _turn_of(tree: Path, words: Sequence[str], config: Path) -> Turn:
     """Return one turn of a tree's own bench, with its version of a robot file of this checkout."""
     config = config.resolve()
     if config.is_relative_to(CHECKOUT):

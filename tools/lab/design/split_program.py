@@ -131,7 +131,7 @@ def solve(
         lead_easing=config.law.lead_easing,
     )
     if design is None:
-        design = choose_design(config, dynamic_nodes(config, stiffness), report)
+        design = _choose_design(config, dynamic_nodes(config, stiffness), report)
     elif check:
         check_design(config, dynamic_nodes(config, stiffness), design, report)
     return msgspec.structs.replace(
@@ -235,7 +235,7 @@ def _rounded(D: Array) -> LegGains:
     return a, b, c, d, e, f
 
 
-def choose_design(
+def _choose_design(
     config: RobotConfig, nodes: list[StiffnessNode], report: Report = lambda _text: None
 ) -> Design:
     """Return the design of a robot, from the poses of its schedule.

@@ -25,7 +25,7 @@ M = TypeVar("M", bound=Message)
 _encode: Final = msgspec.json.Encoder().encode
 
 
-class BySeq(Generic[M]):
+class _BySeq(Generic[M]):
     """Finds a sender's message by its number; a restarted sender counts from the start again."""
 
     def __init__(self, messages: Iterable[M]) -> None:
@@ -122,9 +122,9 @@ class PlannerExecution:
         self._log_robot = log.robot
         snapshots: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
         self._snapshots = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in snapshots}
-        self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
-        self._wrenches = BySeq(log.messages(topics.WRENCH))
-        self._attitudes = BySeq(log.messages(topics.ATTITUDE))
+        self._states = [_BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
+        self._wrenches = _BySeq(log.messages(topics.WRENCH))
+        self._attitudes = _BySeq(log.messages(topics.ATTITUDE))
         self._commands: dict[tuple[str, int, int], JointCommand] = {
             (name, command.session, command.seq): command
             for name in MODULES

@@ -161,7 +161,7 @@ def _write(
     console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
     with interrupts.kept():
         outcomes = apply(console, boards, difference, interrupts)
-    code = conclude(console, robot, outcomes) if difference else 0
+    code = _conclude(console, robot, outcomes) if difference else 0
     if interrupts.number:
         begun = {outcome.change.module for outcome in outcomes}
         rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
@@ -292,7 +292,7 @@ def apply(
     return outcomes
 
 
-def conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResult]) -> int:
+def _conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResult]) -> int:
     """Say what came of it and return the exit code."""
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:

@@ -119,7 +119,7 @@ def run(flags: ZeroFlags) -> int:
     console = Console()
     path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
-    wanted = angles_of(flags, robot, console)
+    wanted = _angles_of(flags, robot, console)
     modules = flags.modules
     holders = {module: drive_access.service_on(robot, module, flags.run_dir) for module in modules}
     with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
@@ -316,7 +316,7 @@ class _Zeroing(NamedTuple):
             self.console.print(marked("[yellow]{}[/]", error))
 
 
-def angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[str, Pair]:
+def _angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[str, Pair]:
     """Return the position (phi, theta), rad, of each selected module, inside its limits."""
     wanted: dict[str, Pair] = {}
     if flags.at is not None:

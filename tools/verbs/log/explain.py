@@ -78,7 +78,7 @@ def run(flags: ExplainFlags) -> int:
     console = Console()
     index = RunIndex(flags.log)
     zero = zero_ns(index)
-    log = read_around(index, zero, flags.at)
+    log = _read_around(index, zero, flags.at)
     refuse_own_controller(log)
     robot = robot_of(log)
     tick = tick_at(log, flags.at, zero)
@@ -100,7 +100,7 @@ def run(flags: ExplainFlags) -> int:
     return 0
 
 
-def read_around(index: RunIndex, zero: int, at_s: float | None) -> RunLog:
+def _read_around(index: RunIndex, zero: int, at_s: float | None) -> RunLog:
     """Read a run; of a long one what is around a time, or its end."""
     if index.length_s <= LONG_S:
         return RunLog(index)
@@ -235,7 +235,7 @@ def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
     ):  # fmt: skip
         console.print(marked("margin, {}: {}", who, describe(weakest)))
     for name, limits in found.pushes.items():
-        console.print(f"push {name}: {describe_limits(limits)}", highlight=False, soft_wrap=True)
+        console.print(f"push {name}: {_describe_limits(limits)}", highlight=False, soft_wrap=True)
     console.print()
     console.print(_torques(found))
 
@@ -260,7 +260,7 @@ def describe(weakest: Weakest) -> Text:
     )
 
 
-def describe_limits(limits: PushLimits) -> str:
+def _describe_limits(limits: PushLimits) -> str:
     """Return for example "led 72 N (left sole's toe), planner dead 56 N (...), ..."."""
     who = ("led", "planner dead", "drives alone", "soles and motors bear")
     return ", ".join(

@@ -82,7 +82,7 @@ def run(flags: WhatIfFlags) -> int:
         raise RunError(
             f"{' and '.join(kill)}: did not run in this part; give another --from or --to"
         )
-    true_plant = plant_of(log)
+    true_plant = _plant_of(log)
     led = hand_path(log)
     tasks = [
         Task(robot, scenario, true_plant, moment, kill, flags.for_s, led) for moment in moments
@@ -125,7 +125,7 @@ def scenario_of(log: RunLog) -> Scenario:
     return scenario
 
 
-def plant_of(log: RunLog) -> PlantConfig:
+def _plant_of(log: RunLog) -> PlantConfig:
     """Return the plant that a run was simulated with.
 
     Raises:

@@ -65,7 +65,7 @@ PUSHED_UNTIL_S: Final = 5.3
 """The pushes come over the bad network, one in each third of the time, at random."""
 
 
-class ControlKind(NamedTuple):
+class _ControlKind(NamedTuple):
     """One way to control the robot."""
 
     about: str
@@ -77,14 +77,14 @@ class ControlKind(NamedTuple):
 
 
 CONTROLS: Final = {
-    "distributed": ControlKind(
+    "distributed": _ControlKind(
         "as shipped: local gains certified, the rest by the planner",
         Lockstep, None, "#1b7f4b", "o",
     ),
-    "diagonal": ControlKind(
+    "diagonal": _ControlKind(
         "the paper's local gains, diag(K_q)", Lockstep, "diagonal", "#c77700", "s"
     ),
-    "centralised": ControlKind(
+    "centralised": _ControlKind(
         "every torque by the planner, and nothing below it: gains not retuned for the delay, no "
         "damping on the drives, the last torques kept when no new ones come, overload ignored",
         CentralisedLockstep, None, "#7b3fa0", "^",
