@@ -1,4 +1,4 @@
-"""What goes wrong on the recorder's host: a full disk; and who is linked.
+"""Watches the recorder's host: free disk space, and which tools are linked.
 
 No other service has the time to look for it. When the disk is too full to go on recording,
 nothing is ever deleted: below the least free space the file is finished while there is still room

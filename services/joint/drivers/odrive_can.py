@@ -150,7 +150,7 @@ class OdriveCan:
                 return self._silence(now)
 
     def _sampled(self, now: int) -> DriveReading:
-        """Return the reading of a new sample; ask for what is due."""
+        """Return the reading of a new sample; send the requests that are due."""
         link, answers = self._link, self._answers
         unheard = self._times.sampled(now)
         status = self._report.status
