@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 from services.planner.intents import Intents, OperatorRequest
-from services.planner.planner import EARLY_FRACTION, Planner
+from services.planner.planner import Planner
 from shared import log
 from shared.bus.messages import (
     Attitude,
@@ -88,12 +88,13 @@ class _Checkpoints:
 
 
 POLL_NS = 200 * NS_PER_US
-"""ns between two polls for states, once they are due."""
-REST_FRACTION = 0.9
-"""Fraction of a period after the states were due in which no new ones are expected."""
+"""ns between two looks for states that are not all there when they were expected."""
 FOLLOW_NS = 50 * NS_PER_US
-"""ns by which the time at which states are due follows late ones from tick to tick: a tick that was
-held up makes none of the following late."""
+"""Maximum ns by which one late tick moves the time at which the next states are expected: a tick
+that was held up makes none of the following late."""
+EARLIER_NS, EARLIER_MAX_NS = 10 * NS_PER_US, 400 * NS_PER_US
+"""ns by which states are expected earlier after a tick that found them at its first look: they may
+have been there for a while. It doubles with each such tick in a row, up to the maximum."""
 
 
 class PlannerLoop:
@@ -109,7 +110,7 @@ class PlannerLoop:
         self.planner = planner
         self._ports, self._clock = ports, clock or now_ns
         self._period_ns = round(NS_PER_S / config.planner.rate_hz)
-        self._due_ns = 0
+        self._due_ns = self._earlier_ns = 0
         self._checkpoints = _Checkpoints(config.planner.rate_hz)
         self._yielded = False
         self._announced = 0
@@ -128,19 +129,25 @@ class PlannerLoop:
     def _next_look(self, now: int, *, ticked: bool) -> int:
         """Return when to look for states again, ns, after a look `now`.
 
-        It looks once halfway between two ticks. A planner that ticks just before its states arrive
-        finds them there. Without that look it found them a period later, when the joint services
-        on its processor let it run again, and stayed a period late for up to 0.8 s.
+        Each look wakes the process with cold caches, so it looks once in a period, when the last
+        state is expected, and then every `POLL_NS`. The expected time follows the arrivals: from a
+        whole period too late it is back within 15 ticks.
         """
-        period = self._period_ns
-        if ticked:
-            expected = self._due_ns + period + FOLLOW_NS
-            self._due_ns = now if now - expected > period else min(now, expected)
+        if not ticked:
+            self._earlier_ns = 0
+            return now + POLL_NS
+        expected = self._due_ns + self._period_ns
+        if now - expected > self._period_ns:
+            expected = now
+        elif self._earlier_ns == 0 or self.planner.compares_arrivals:
+            expected = min(now, expected + FOLLOW_NS)
+        else:
+            expected -= self._earlier_ns
+        self._earlier_ns = min(max(EARLIER_NS, 2 * self._earlier_ns), EARLIER_MAX_NS)
+        self._due_ns = expected
         if self.planner.compares_arrivals:
             return now + POLL_NS
-        if ticked:
-            return now + round(EARLY_FRACTION * period)
-        return max(now + POLL_NS, self._due_ns + round(REST_FRACTION * period))
+        return max(now + POLL_NS, expected + self._period_ns)
 
     def receive_states(self, now: int) -> bool:
         """Receive new states; return True if a tick is due."""
