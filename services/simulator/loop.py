@@ -145,7 +145,8 @@ class SimulatorLoop:
     def _exchanges_nothing(self) -> bool:
         """Return True if the next step neither receives from the services nor sends to them."""
         begins_ns = self._steps * self._every.step
-        return not self._usb and all(begins_ns % period_ns for period_ns in self._exchanges)
+        exchanged = (begins_ns % period_ns == 0 for period_ns in self._exchanges)
+        return not any(exchanged) and not any(hub.clients for hub in self._usb)
 
     def _ask(self) -> None:
         """Publish the scenario's request; if another operator publishes one, rest that much."""
