@@ -85,6 +85,19 @@ def test_threads_of_a_core_stay_in_one_half_and_the_shipped_setting_is_the_docto
     assert scheduling.has_real_time(2**22 + 1) is None
 
 
+def test_processors_are_kept_awake_by_a_latency_of_0_where_the_kernel_takes_it(
+    tmp_path: Path,
+) -> None:
+    assert scheduling.keep_processors_awake(tmp_path) is None
+    file = tmp_path / scheduling.IDLE_LATENCY
+    file.parent.mkdir()
+    file.touch()
+    held = scheduling.keep_processors_awake(tmp_path)
+    assert held is not None
+    os.close(held)
+    assert file.read_bytes() == bytes(4)
+
+
 @pytest.mark.parametrize(
     ("limit", "capable", "may"),
     [(resource.RLIM_INFINITY, False, True), (1 << 30, True, True), (1 << 30, False, False),

@@ -126,6 +126,8 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
     may_lock, areas = scheduling.may_lock(), len(_text(root / "proc/swaps").splitlines()) - 1
     locked = f"refused: {resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] // 1024} KiB"
     pause_ms = scheduling.real_time_pause_ms(root)
+    idle = root / scheduling.IDLE_LATENCY
+    awake = not idle.exists() or os.access(idle, os.W_OK)
     rows = (
         (governor in ("", "performance"), "frequency governor", governor or "unknown here",
          "performance", "`sudo cpupower frequency-set -g performance`",
@@ -141,6 +143,9 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
         (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
          "`sudo swapoff -a`",
          "a service that may not lock its memory stops for a page that was swapped out"),
+        (awake, "idle processors", "stay awake" if awake else "sleep", "stay awake",
+         f"`sudo cp {FILES}/udev/93-xrl.rules /etc/udev/rules.d/`, then follow its header",
+         "each cycle of a loop takes longer on a processor that was asleep"),
         (pause_ms <= 0.0, "real-time pause", f"{pause_ms:g} ms" if pause_ms else "none", "none",
          f"`sudo cp {FILES}/sysctl/90-xrl.conf /etc/sysctl.d/ && sudo sysctl --system`",
          "for that time of each second the kernel stops what fills a processor: modules hold"),

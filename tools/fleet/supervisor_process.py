@@ -25,6 +25,7 @@ from supervisor import events, loggers, options, process, supervisord
 from supervisor.options import ServerOptions, decode_wait_status
 from supervisor.states import ProcessStates, getProcessStateDescription
 
+from shared import scheduling
 from shared.arguments import FlagParser
 from shared.run_directory import FLEET_VARIABLE
 from tools.fleet import kept_state
@@ -211,6 +212,7 @@ def main() -> None:
     # As `run_dir.one_line` writes it: a value is what stands there, whatever characters it has.
     options.UnhosedConfigParser = partial(options.UnhosedConfigParser, inline_comment_prefixes=None)
     options.expand = lambda value, _expansions, _name: value
+    scheduling.keep_processors_awake()  # until this process ends; no service inherits it
     run_dir = Path(os.environ[FLEET_VARIABLE])
     events.subscribe(events.Tick5Event, lambda _event: kept_state.save(run_dir))
     supervisord.main([word for word in args.arguments if word != "--"])

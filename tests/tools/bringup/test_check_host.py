@@ -63,6 +63,15 @@ def test_a_slow_loop_is_a_warning_on_a_real_robot_and_a_note_on_an_emulated_one(
         assert (row.verdict, row.found) == (verdict, found)
 
 
+def test_processors_that_sleep_are_warned_of_where_the_supervisor_may_not_keep_them_awake(
+    real: RobotConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, scheduling.IDLE_LATENCY, "")
+    assert row_of(machine_rows(real, tmp_path), "idle processors").verdict is OK
+    monkeypatch.setattr(os, "access", lambda _path, mode: mode != os.W_OK)
+    assert row_of(machine_rows(real, tmp_path), "idle processors").verdict is WARNING
+
+
 @pytest.mark.parametrize(
     ("synchronised", "verdict"), [(False, FindingKind.WARNING), (True, FindingKind.OK)]
 )
