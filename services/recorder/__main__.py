@@ -81,7 +81,7 @@ def main() -> int:
     # The bus before the file: an endpoint that is taken leaves no empty file behind.
     name = topics.HOST_RECORDER if arguments.of else topics.RECORDER
     with open_session(config, name, arguments.run_dir, only=arguments.of) as session:
-        stream = session.stream([f"xrl/{config.name}/**"], capacity=CAPACITY)
+        stream = session.recording(CAPACITY)
         auto_recovery = AutoRecovery(arguments.out, config.recorder.free_min_mib * MIB, logger)
         try:
             with RunWriter(
@@ -131,8 +131,8 @@ def _recorded(robot: str, of: tuple[str, ...] | None) -> dict[str, topics.Topic]
     )
     return {
         key: topic
-        for key, topic in topics.all_keys(robot).items()
-        if topic.recorded and (wanted is None or key in wanted)
+        for key, topic in topics.recorded_keys(robot).items()
+        if wanted is None or key in wanted
     }
 
 

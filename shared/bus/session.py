@@ -20,19 +20,21 @@ import re
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Generic, Self, TypeAlias, TypeVar
 
+import msgspec
 import zenoh
 
 from shared import log
-from shared.bus import security, sockets, tls_probe
+from shared.bus import security, sockets, tls_probe, topics
 from shared.bus.codec import Decoder, encode
 from shared.bus.credentials import read_credentials
 from shared.bus.messages import Message
 from shared.bus.security import alive_prefix, token_key, tools_prefix
 from shared.bus.topics import Priority, Topic
+from shared.bus.traces import Batch
 from shared.clock import keep_pace, now_ns
 from shared.config.endpoints import host_and_port, is_endpoint
 from shared.config.robot_config import SERVICES, RobotConfig, expand
@@ -44,6 +46,7 @@ from shared.run_directory import private_files
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
+_Put: TypeAlias = Callable[[bytes], None]
 _Subscriber: TypeAlias = "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
 
 _SETTINGS: Final[dict[str, object]] = {
@@ -77,6 +80,8 @@ _PRIORITIES: Final = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
+_BATCH_MAX: Final = 64
+"""Messages in a batch, if none of them closes it."""
 _ALIVE_TIMEOUT_S: Final = 0.2
 _TOOLS_MAX: Final = 128
 """Tools that are named: as many as there may be links."""
@@ -100,11 +105,49 @@ def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
     return (*MODULES, *central[: central.index(name)])
 
 
+class _BatchSender:
+    """Puts what a service publishes once more, for the recorder, many messages at a time.
+
+    A recorder that subscribes to each key is woken for each message, and Zenoh's thread with it at
+    both ends.
+    """
+
+    def __init__(self, put: _Put) -> None:
+        self._put = put
+        self._seq = 0
+        self._messages: list[tuple[str, msgspec.Raw]] = []
+
+    def also(self, key: str, put: _Put, *, closes: bool) -> _Put:
+        """Return a `put` of one key that also adds the payload to the batch.
+
+        The batch leaves with a payload that closes it.
+        """
+        messages = self._messages
+
+        def put_and_add(payload: bytes) -> None:
+            put(payload)
+            messages.append((key, msgspec.Raw(payload)))
+            if closes or len(messages) == _BATCH_MAX:
+                self.send()
+
+        return put_and_add
+
+    def send(self) -> None:
+        """Put what has been gathered, if there is anything."""
+        if self._messages:
+            self._seq += 1
+            batch = Batch(t_ns=now_ns(), seq=self._seq, messages=tuple(self._messages))
+            self._messages.clear()
+            self._put(encode(batch))
+
+
 class Publisher(Generic[T]):
     """Puts the messages of one key on the bus."""
 
-    def __init__(self, publisher: zenoh.Publisher, encoded: Callable[[T], bytes]) -> None:
-        self._publisher, self._put, self._encoded = publisher, publisher.put, encoded
+    def __init__(
+        self, publisher: zenoh.Publisher, encoded: Callable[[T], bytes], put: _Put | None = None
+    ) -> None:
+        self._publisher, self._put, self._encoded = publisher, put or publisher.put, encoded
         self.failed = 0
         """Messages that were not sent: a value cannot be encoded, or the session is closed."""
         self._has_reported = False
@@ -171,6 +214,23 @@ class Latest(Generic[M]):
         return self._decoder.decode(sample.payload.to_bytes())
 
 
+class LatestInBatch(Latest[M]):
+    """Holds the newest message of one key, out of the batches for the recorder."""
+
+    def __init__(self, batches: _Subscriber, key: str, message_type: type[M]) -> None:
+        super().__init__(batches, message_type)
+        self._key, self._batches = key, Decoder(Batch)
+
+    def take(self) -> M | None:
+        """Return the newest message of the newest batch if it was not taken before, else None."""
+        sample = self._try_recv()
+        batch = None if sample is None else self._batches.decode(sample.payload.to_bytes())
+        for key, payload in reversed(() if batch is None else batch.messages):
+            if key == self._key:
+                return self._decoder.decode(bytes(payload))
+        return None
+
+
 class Stream:
     """Every sample of some keys, undecoded: for the recorder and for tools."""
 
@@ -190,6 +250,34 @@ class Stream:
             if sample is not None:
                 return str(sample.key_expr), sample.payload.to_bytes(), now_ns()
         return None
+
+
+class Recording(Stream):
+    """Every message that is recorded, undecoded, out of its batch."""
+
+    def __init__(
+        self, subscribers: Sequence[_Subscriber], keys_by_batch: Mapping[str, Container[str]]
+    ) -> None:
+        """Take the subscribers, and the keys that may be in the batches of each batch's key."""
+        super().__init__(subscribers)
+        self._keys_by_batch = keys_by_batch
+        self._decoder = Decoder(Batch)
+        self._waiting: deque[tuple[str, bytes]] = deque()
+
+    def take(self) -> tuple[str, bytes, int] | None:
+        """Return (key, payload, time in monotonic ns) of the oldest message, or None.
+
+        A message in a batch whose sender may not put it is left out.
+        """
+        while not self._waiting:
+            sample = super().take()
+            if sample is None or sample[0] not in self._keys_by_batch:
+                return sample
+            allowed = self._keys_by_batch[sample[0]]
+            batch = self._decoder.decode(sample[1])
+            if batch is not None:
+                self._waiting.extend((k, bytes(raw)) for k, raw in batch.messages if k in allowed)
+        return *self._waiting.popleft(), now_ns()
 
 
 def place_of_tool() -> str:
@@ -228,6 +316,7 @@ class Session:
         self.name = name
         self._session = session
         self._alive_prefix = f"{alive_prefix(robot)}/"
+        self._batches: dict[str, _BatchSender] = {}
         self._token = session.liveliness().declare_token(token_key(robot, name, place_of_tool()))
         if over_tcp:  # held, or it would end
             self._links = session.info.declare_link_events_listener(self._meet, history=True)
@@ -246,6 +335,8 @@ class Session:
         Takes up to one lease if a peer is stopped; never raises.
         """
         with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
+            for batch in self._batches.values():
+                batch.send()
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
     def publisher(self, topic: Topic, message_type: type[M], module: str = "") -> Publisher[M]:
@@ -255,13 +346,22 @@ class Session:
         does not fit the topic.
         """
         key = self._key(topic, message_type, module)
-        publisher = self._session.declare_publisher(
+        publisher = self._declare(topic, key)
+        if topic.batch is None:
+            return Publisher(publisher, encode)
+        batch_key = topic.batch.key(self.robot, module)
+        if batch_key not in self._batches:
+            self._batches[batch_key] = _BatchSender(self._declare(topic.batch, batch_key).put)
+        batch = self._batches[batch_key]
+        return Publisher(publisher, encode, batch.also(key, publisher.put, closes=topic.closes))
+
+    def _declare(self, topic: Topic, key: str) -> zenoh.Publisher:
+        return self._session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=_PRIORITIES[topic.priority],
             express=False,
         )
-        return Publisher(publisher, encode)
 
     def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
         """Declare a publisher of encoded payloads on any full key; BusError if it is malformed.
@@ -284,6 +384,19 @@ class Session:
         key = self._key(topic, message_type, module)
         return Latest(_ring(self._session, key, 1), message_type)
 
+    def latest_in_batch(
+        self, topic: Topic, message_type: type[M], module: str = ""
+    ) -> LatestInBatch[M]:
+        """As `latest`, for a tool that only shows: the service sends nothing more for it.
+
+        The message comes when its batch does.
+        """
+        key = self._key(topic, message_type, module)
+        if topic.batch is None:
+            raise BusError(f"{topic.name}: is in no batch; use `latest`")
+        batches = _ring(self._session, topic.batch.key(self.robot, module), 1)
+        return LatestInBatch(batches, key, message_type)
+
     def stream(self, key_expressions: Sequence[str], capacity: int = 65536) -> Stream:
         """Declare a subscriber that keeps every sample, up to `capacity` per expression.
 
@@ -294,6 +407,13 @@ class Session:
             return Stream([_ring(self._session, key, capacity) for key in key_expressions])
         except zenoh.ZError as error:
             raise BusError(f"{', '.join(key_expressions)}: {_reason(error)}") from None
+
+    def recording(self, capacity: int) -> Recording:
+        """Declare subscribers of all that is recorded; `capacity` samples wait for each key."""
+        in_batches = topics.keys_by_batch(self.robot)
+        direct = [t for t in topics.TOPICS if t.recorded and t.batch is None]
+        keys = (*in_batches, *(t.key(self.robot, "*") for t in direct))
+        return Recording([_ring(self._session, key, capacity) for key in keys], in_batches)
 
     def alive(self) -> set[str]:
         """Return the services that this process has a link with, and itself if it is one.

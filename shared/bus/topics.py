@@ -49,6 +49,10 @@ class Topic(msgspec.Struct, frozen=True):
     """Services that use it; `READERS_OF_ALL` may read every topic."""
     why: str
     recorded: bool = True
+    batch: Topic | None = None
+    """The topic that takes it to the recorder, with others (`Batch`); None: its own key does."""
+    closes: bool = False
+    """True if the batch leaves with it."""
 
     def key(self, robot: str, module: str = "") -> str:
         """Return the full key, for example `xrl/lab/joint/ankle_right/state`."""
@@ -60,21 +64,30 @@ class Topic(msgspec.Struct, frozen=True):
         return "*" in self.name
 
 
+JOINT_BATCH: Final = Topic(
+    "joint/*/batch", traces.Batch, 50.0, _DATA, ("*",), (),
+    "states, events and traces of a module, for the recorder", recorded=False,
+)  # fmt: skip
+PLANNER_BATCH: Final = Topic(
+    "planner/batch", traces.Batch, 250.0, _DATA, ("planner",), (),
+    "commands, status and checkpoint of a tick, for the recorder", recorded=False,
+)  # fmt: skip
 JOINT_STATE: Final = Topic(
     "joint/*/state", messages.JointState, 250.0, _REAL_TIME, ("*",), ("planner",),
-    "the planner's input; its stamp is echoed",
+    "the planner's input; its stamp is echoed", batch=JOINT_BATCH,
 )  # fmt: skip
 JOINT_COMMAND: Final = Topic(
     "joint/*/command", messages.JointCommand, 250.0, _REAL_TIME, ("planner",), ("*",),
-    "references, gains and torques of the law",
+    "references, gains and torques of the law", batch=PLANNER_BATCH,
 )  # fmt: skip
 JOINT_EVENT: Final = Topic(
     "joint/*/event", messages.JointEvent, 0.0, _DATA, ("*",), (),
-    "every change of state, with its cause and torque step",
+    "every change of state, with its cause and torque step", batch=JOINT_BATCH, closes=True,
 )  # fmt: skip
 JOINT_TRACE: Final = Topic(
     "joint/*/trace", traces.JointTrace, 50.0, _BACKGROUND, ("*",), (),
     "every cycle's inputs: a joint service can be re-executed from them, bit for bit",
+    batch=JOINT_BATCH, closes=True,
 )  # fmt: skip
 WRENCH: Final = Topic(
     "harness/wrench", messages.Wrench, 250.0, _DATA, ("harness",), ("planner",),
@@ -90,11 +103,12 @@ HARNESS_TARE: Final = Topic(
 )  # fmt: skip
 PLANNER_STATUS: Final = Topic(
     "planner/status", messages.PlannerStatus, 250.0, _DATA, ("planner",), (),
-    "inputs and decisions of the law",
+    "inputs and decisions of the law", batch=PLANNER_BATCH, closes=True,
 )  # fmt: skip
 PLANNER_CHECKPOINT: Final = Topic(
     "planner/checkpoint", traces.PlannerCheckpoint, 1.0, _BACKGROUND, ("planner",), (),
     "the planner's state, more often at its start: re-execution can start here",
+    batch=PLANNER_BATCH,
 )  # fmt: skip
 OPERATOR_INTENT: Final = Topic(
     "operator/intent", messages.OperatorIntent, 50.0, _DATA, (OPERATOR, "simulator"),
@@ -151,9 +165,25 @@ def keys(topic: Topic, robot: str) -> tuple[str, ...]:
     return (topic.key(robot),)
 
 
+def keys_by_batch(robot: str) -> dict[str, set[str]]:
+    """Return the full keys whose messages the batches on a full key may hold."""
+    found: dict[str, set[str]] = {}
+    for topic in TOPICS:
+        if topic.batch is not None:
+            for module in MODULES:
+                batch = topic.batch.key(robot, module)
+                found.setdefault(batch, set()).add(topic.key(robot, module))
+    return found
+
+
 def all_keys(robot: str) -> dict[str, Topic]:
     """Return the topic of every full key of a robot."""
     return {key: topic for topic in TOPICS for key in keys(topic, robot)}
+
+
+def recorded_keys(robot: str) -> dict[str, Topic]:
+    """Return the topic of every full key of a robot that the recorder writes."""
+    return {key: topic for key, topic in all_keys(robot).items() if topic.recorded}
 
 
 def written_keys(robot: str, name: str) -> tuple[str, ...]:

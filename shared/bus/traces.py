@@ -171,6 +171,13 @@ class SimState(Message, frozen=True):
     """Temperatures of windings, housings and output stages, C, 12 each; empty: not known."""
 
 
+class Batch(Message, frozen=True):
+    """Messages of one service for the recorder, which is woken once for all of them."""
+
+    messages: tuple[tuple[str, msgspec.Raw], ...]
+    """Full key and payload of each, in the order in which they were put."""
+
+
 class LinkEvent(Message, frozen=True):
     """A change of the impairment of one direction of a link."""
 

@@ -65,7 +65,7 @@ class Rig:
 
 def rig(out: Path, *, snapshot_s: float = 0.0, free: int = 10_000 * MIB, **changes: float) -> Rig:
     settings = {"chunk_kib": 64, "flush_ms": 250.0, "fsync_s": 1.0, "free_min_mib": 100}
-    ring = SnapshotRing(snapshot_s, 1 << 28, runs.recorded_topics()) if snapshot_s else None
+    ring = SnapshotRing(snapshot_s, 1 << 28, topics.recorded_keys(ROBOT)) if snapshot_s else None
     return Rig(out, RecorderConfig(**settings | changes), ring, free)  # type: ignore[arg-type]
 
 

@@ -18,10 +18,12 @@ from mcap.reader import make_reader
 from shared.bus import topics
 from shared.bus.messages import JointState
 from shared.bus.session import Publisher, open_session
+from shared.bus.traces import JointTrace
 from shared.config.files import load
 from shared.exceptions import RunError
 from shared.places import DEFAULT_CONFIG
 from shared.run_directory import live_dir
+from tests.messages import sample
 from tests.shared.mcap_log import runs
 from tests.waiting import comes_true
 from tools import cli
@@ -41,13 +43,15 @@ def states(log: RunLog) -> list[JointState]:
 class Rig:
     """A recorder under test and a publisher that it hears."""
 
-    def __init__(self, run_dir: Path, put: Publisher[JointState], *flags: str):
+    def __init__(
+        self, run_dir: Path, put: Publisher[JointState], close: Publisher[JointTrace], *flags: str
+    ):
         self.run_dir = run_dir
         self.out = run_dir / "out"
         self.path = self.out / "run.mcap"
         self.sent_at: list[float] = []
         """When each sequence number was published."""
-        self._publisher = put
+        self._publisher, self._closing = put, close
         self.process = self.start(*flags)
 
     @property
@@ -68,6 +72,7 @@ class Rig:
             self.sent_at.append(time.monotonic())
             if self.sent % 20 == 0:
                 time.sleep(0.005)
+        assert self._closing.put(sample(JointTrace, seq=self.sent)), "the batch leaves with it"
 
     def read(self, name: str = "run.mcap") -> RunLog | None:
         try:
@@ -107,7 +112,8 @@ def rig_with(*flags: str) -> Iterator[Rig]:
         (run_dir / "model.xml").write_text("<mujoco/>")
         with open_session(CONFIG, "planner", run_dir) as session:
             publisher = session.publisher(topics.JOINT_STATE, JointState, "knee_right")
-            rig = Rig(run_dir, publisher, *flags)
+            closing = session.publisher(topics.JOINT_TRACE, JointTrace, "knee_right")
+            rig = Rig(run_dir, publisher, closing, *flags)
             try:
                 yield rig
             finally:

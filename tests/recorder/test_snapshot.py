@@ -16,7 +16,7 @@ TRUTH_KEY = topics.SIM_TRUTH.key(ROBOT)
 
 
 def ring(seconds: float = 10.0, most_bytes: int = 1 << 24) -> SnapshotRing:
-    return SnapshotRing(seconds, most_bytes, runs.recorded_topics())
+    return SnapshotRing(seconds, most_bytes, topics.recorded_keys(ROBOT))
 
 
 def at(second: float, key: str = TRUTH_KEY, payload: bytes = b"{}") -> Item:

@@ -10,12 +10,15 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from shared import run_directory
 from shared.bus import topics
-from shared.bus.messages import Estop, JointCommand, JointEvent, Wrench
+from shared.bus.codec import encode
+from shared.bus.messages import Estop, JointCommand, JointEvent, JointState, Wrench
 from shared.bus.session import Latest, Publisher, Session, open_session
+from shared.bus.traces import Batch, JointTrace
 from shared.config import files as config_file
 from shared.exceptions import BusError
 from shared.joints import MODULES
@@ -304,10 +307,75 @@ def test_session_that_cannot_be_opened_is_one_clear_error(
     assert "\n" not in str(caught.value)
 
 
+MODULE = "knee_left"
+
+
+class Recorded:
+    """A joint service, a recorder, and a tool that shows the newest state."""
+
+    def __init__(self, joint: Session, recorder: Session, tool: Session) -> None:
+        self.states = joint.publisher(topics.JOINT_STATE, JointState, MODULE)
+        self.traces = joint.publisher(topics.JOINT_TRACE, JointTrace, MODULE)
+        self.batches = joint.publisher(topics.JOINT_BATCH, Batch, MODULE)
+        self.shown = tool.latest_in_batch(topics.JOINT_STATE, JointState, MODULE)
+        self._recording = recorder.recording(1000)
+        self.taken: list[tuple[str, int]] = []
+        assert comes_true(lambda: self.traces.put(sample(JointTrace, seq=0)) and self.take())
+        time.sleep(0.2)  # what was under way has come
+        self.take()
+        self.taken.clear()
+
+    def take(self) -> int:
+        for key, payload, _ in iter(self._recording.take, None):
+            number = msgspec.json.decode(payload)["seq"]
+            self.taken.append((key.rpartition("/")[2], number))
+        return len(self.taken)
+
+
+@pytest.fixture
+def recorded(run_dir: Path) -> Iterator[Recorded]:
+    with (
+        open_session(ROBOT, MODULE, run_dir) as joint,
+        open_session(ROBOT, "recorder", run_dir) as recorder,
+        open_session(ROBOT, TOOL, run_dir) as tool,
+    ):
+        yield Recorded(joint, recorder, tool)
+
+
+def test_a_batch_brings_each_message_to_the_record_once_in_its_order(recorded: Recorded) -> None:
+    for seq in (1, 2, 3):
+        recorded.states.put(sample(JointState, seq=seq))
+    recorded.traces.put(sample(JointTrace, seq=1))
+    recorded.states.put(sample(JointState, seq=4))
+    expected = [("state", 1), ("state", 2), ("state", 3), ("trace", 1)]
+    assert comes_true(lambda: recorded.take() == len(expected))
+    time.sleep(0.1)
+    recorded.take()
+    assert recorded.taken == expected, "the fourth state waits for its trace"
+    newest = recorded.shown.take()
+    assert newest is not None
+    assert newest.seq == 3
+
+
+def test_a_batch_brings_nothing_that_its_sender_may_not_put(recorded: Recorded) -> None:
+    keys = (
+        topics.JOINT_COMMAND.key(ROBOT.name, MODULE),
+        topics.JOINT_STATE.key(ROBOT.name, "knee_right"),
+        topics.JOINT_STATE.key(ROBOT.name, MODULE),
+    )
+    rows = tuple((key, msgspec.Raw(encode(sample(JointState, seq=7)))) for key in keys)
+    recorded.batches.put(Batch(t_ns=1, seq=1, messages=rows))
+    assert comes_true(lambda: recorded.take() > 0)
+    time.sleep(0.1)
+    recorded.take()
+    assert recorded.taken == [("state", 7)]
+
+
 USES_REFUSED: dict[str, Callable[[Session], object]] = {
     "harness/wrench: Estop is not its type; use W": lambda s: s.publisher(topics.WRENCH, Estop),
     r"joint/\*/command: '' is no module": lambda s: s.latest(topics.JOINT_COMMAND, JointCommand),
     "leave the module out": lambda s: s.latest(topics.WRENCH, Wrench, "ankle_right"),
+    "in no batch": lambda s: s.latest_in_batch(topics.WRENCH, Wrench),
     "xrl//estop": lambda s: s.stream(["xrl//estop"]),
 }
 

@@ -84,7 +84,7 @@ def test_a_stall_of_the_machine_is_marked_in_line_record_and_verdict(tmp_path: P
         pytest.skip("this machine stalled so often that the scenario could not begin")
     assert process.returncode == 0, text
     live, _, verdict = text.partition("Verdict")
-    assert re.search(r"stalled for \d+ ms: all six h[eo]ld", live), text
+    assert re.search(r"stalled for \d+ ms: all six held", live), text
     assert re.search(r"\d s: .* stalled for \d+ ms: all six held", verdict), text
     log = read_run(tmp_path / "run.mcap")
     longest_ms = max(row.lasted_ms for row in stalls_of(log.messages(topics.RUN_EVENT)))

@@ -65,7 +65,7 @@ def write(
     """Write a run of the shipped robot, in one file or several, and return its directory."""
     monkeypatch.setitem(runs.METADATA, "run", {**runs.METADATA["run"], "robot": NAME})
     monkeypatch.setitem(runs.ATTACHMENTS, "robot.toml", config_file.to_toml(ROBOT).encode())
-    runs.write_in_parts(runs.writer(directory, keys=topics.all_keys(NAME)), rows, parts)
+    runs.write_in_parts(runs.writer(directory, keys=topics.recorded_keys(NAME)), rows, parts)
     return str(directory)
 
 

@@ -185,7 +185,8 @@ class ScenarioRunner:
         self._events = _RunEvents(session)
         self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
         self._states = {
-            module: session.latest(topics.JOINT_STATE, JointState, module) for module in MODULES
+            module: session.latest_in_batch(topics.JOINT_STATE, JointState, module)
+            for module in MODULES
         }
         self._planner: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._control = session.publisher(topics.SIM_CONTROL, SimControl)
@@ -197,6 +198,8 @@ class ScenarioRunner:
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
         self._stalls = StallWatch()
+        self._held = 0
+        """The most modules in HOLD at once since the newest stall."""
         self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
@@ -356,6 +359,8 @@ class ScenarioRunner:
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
         stalls = self._stalls.take()
+        holding = list(self._modes.values()).count(Mode.HOLD)
+        self._held = holding if stalls else max(self._held, holding)
         if self._note != STARTING:  # services that start take the machine's time
             self._events.tell(stalls)
 
@@ -364,9 +369,8 @@ class ScenarioRunner:
         newest = self._stalls.newest
         if newest is None or now_ns() - newest.end_ns > STALL_SHOWN_NS or self._note == STARTING:
             return ""
-        held = list(self._modes.values()).count(Mode.HOLD)
-        who = "all six" if held == len(MODULES) else held
-        by_it = f": {who} hold" if held and not self._killed else ""
+        who = "all six" if self._held == len(MODULES) else self._held
+        by_it = f": {who} held" if self._held and not self._killed else ""
         return f"{newest.words}{by_it}"
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:

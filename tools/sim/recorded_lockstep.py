@@ -84,7 +84,7 @@ def record_run(
     """
     inputs = experiment.write_inputs(out, robot, scenario, true_plant)
     messages = RecordedMessages(robot.name)
-    recorded = {key: topic for key, topic in topics.all_keys(robot.name).items() if topic.recorded}
+    recorded = topics.recorded_keys(robot.name)
     run_metadata = {
         "schema_version": SCHEMA_VERSION,
         "robot": robot.name,

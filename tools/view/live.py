@@ -183,7 +183,10 @@ class LiveSource(Source):
             return
         session = self._session = open_session(self.robot, "view", self._fleet.run.path)
         self._newest.clear()
-        self._latest = [(t, m, session.latest(t, t.type, m)) for t, m in SHOWN]
+        self._latest = [
+            (t, m, (session.latest if t.batch is None else session.latest_in_batch)(t, t.type, m))
+            for t, m in SHOWN
+        ]
         if self._acting is not None:
             self._acting.begin(session)
         self._left.clear()

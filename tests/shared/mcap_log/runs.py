@@ -36,10 +36,6 @@ class Queue:
         return self.items.popleft() if self.items else None
 
 
-def recorded_topics() -> dict[str, Topic]:
-    return {key: topic for key, topic in topics.all_keys(ROBOT).items() if topic.recorded}
-
-
 def state(seq: int) -> JointState:
     found: JointState = sample(JointState, seq=seq, t_ns=1_000_000 * seq, q=(seq * 0.001, -0.37))
     return found
@@ -58,7 +54,7 @@ def writer(
 ) -> RunWriter:
     return RunWriter(
         directory,
-        recorded_topics() if keys is None else keys,
+        topics.recorded_keys(ROBOT) if keys is None else keys,
         offset_ns=OFFSET_NS,
         metadata=METADATA,
         attachments=ATTACHMENTS,
@@ -71,7 +67,7 @@ def writer_like(log: RunLog, directory: Path) -> RunWriter:
     """Return what writes another run with all that is said about a log."""
     return RunWriter(
         directory,
-        {key: topic for key, topic in topics.all_keys(log.robot).items() if topic.recorded},
+        topics.recorded_keys(log.robot),
         offset_ns=log.offset_ns,
         metadata={name: row for name, row in log.metadata.items() if name not in FROM_RECORDER},
         attachments=log.attachments,

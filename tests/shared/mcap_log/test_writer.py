@@ -38,7 +38,7 @@ def test_metadata_and_attachments_come_before_the_first_chunk(tmp_path: Path) ->
     described = [r for r in head if isinstance(r, Schema | Channel)]
     assert len(names) + len(described) == len(head)
     topics_described = {r.topic for r in described if isinstance(r, Channel)}
-    assert topics_described == set(runs.recorded_topics())
+    assert topics_described == set(topics.recorded_keys(runs.ROBOT))
 
 
 def leaves(value: Any) -> Iterator[Any]:
@@ -54,7 +54,7 @@ def test_a_plotter_gets_every_value_of_every_topic(tmp_path: Path) -> None:
     rows = [
         (key, codec.encode(sample(topic.type, seq=seq, t_ns=seq)), seq)
         for seq in range(3)
-        for key, topic in runs.recorded_topics().items()
+        for key, topic in topics.recorded_keys(runs.ROBOT).items()
     ]
     path = runs.write(tmp_path, rows)
     assert len(by_the_package(path)) == len(rows)

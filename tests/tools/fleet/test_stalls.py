@@ -76,12 +76,13 @@ def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says(
 def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     runner = object.__new__(ScenarioRunner)
     runner._stalls, runner._killed = StallWatch(), False
-    runner._modes, runner._note = dict.fromkeys(MODULES, Mode.HOLD), ""
+    runner._modes, runner._held = dict.fromkeys(MODULES, Mode.TRACK), len(MODULES)
+    runner._note = ""
     assert runner._stall_words() == ""
     now = now_ns()
     runner._stalls.newest = Stall(now - ms(63), now)
     words = "the machine stalled for 63 ms"
-    assert runner._stall_words() == f"{words}: all six hold"
+    assert runner._stall_words() == f"{words}: all six held", "though they track again"
     runner._killed = True
     assert runner._stall_words() == words, "they hold for another reason"
     runner._note = STARTING

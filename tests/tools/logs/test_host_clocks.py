@@ -62,7 +62,7 @@ def writer_of(folder: Path, robot: RobotConfig, robot_file: bytes, of: str = "")
     gains = ROBOT_FILE.with_name("robot.gains.json").read_bytes()
     return RunWriter(
         folder,
-        topics.all_keys(robot.name),
+        topics.recorded_keys(robot.name),
         offset_ns=1_600_000_000 * NS_PER_S,
         metadata={"run": {"schema_version": SCHEMA_VERSION, "robot": robot.name, "of": of}},
         attachments={"robot.toml": robot_file, "robot.gains.json": gains},

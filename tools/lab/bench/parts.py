@@ -328,7 +328,7 @@ def _writer(robot: RobotConfig, stack: ExitStack) -> RunWriter:
     return stack.enter_context(
         RunWriter(
             folder,
-            topics.all_keys(robot.name),
+            topics.recorded_keys(robot.name),
             offset_ns=0,
             metadata={},
             attachments={},
