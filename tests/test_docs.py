@@ -15,11 +15,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from services.recorder import host_watch, snapshot
+from services.recorder import host_watch
 from services.simulator.physics import posture
 from shared.bus.session import peers_of
 from shared.bus.topics import TOPICS
-from shared.clock import NS_PER_S
 from shared.config import files
 from shared.config.gain_schedule import inputs_of
 from shared.config.robot_config import SERVICES
@@ -148,8 +147,6 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
         ("logs.md", f"again only once {host_watch.CALM:g} were free"),
         ("logs.md", f"| {host_watch.RESUME:g} and more, after that |"),
         ("logs.md", f"the same factors of {host_watch.RUN_DIR_MIN_MIB} MiB"),
-        ("logs.md", f"silent for {snapshot.SILENT_NS // NS_PER_S} s"),
-        ("logs.md", " or ".join(f"`{row.name}`" for row in snapshot.STEADY[1:])),
         ("law.md", f"down to {CERTIFICATE.margin_min:g} (`certificate.margin_min`)"),
         (
             "law.md",

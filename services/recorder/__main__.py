@@ -2,9 +2,8 @@
 
 A new run never replaces a file: it is then run-1.mcap, run-2.mcap, ... A long run is split into
 run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says. Unfinished files of earlier
-recorders in DIR are recovered meanwhile. With --snapshot nothing is written until a fault. SIGTERM
-and SIGINT finish the file; after SIGKILL the next recorder, or `xrl log recover`, recovers what was
-flushed.
+recorders in DIR are recovered meanwhile. SIGTERM and SIGINT finish the file; after SIGKILL the next
+recorder, or `xrl log recover`, recovers what was flushed.
 
 With --of it is one host's own recorder: it dials these services only, and records what they say
 though the network to the fleet's recorder is cut.
@@ -15,17 +14,14 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import signal
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 from services.recorder.auto_recover import AutoRecovery
 from services.recorder.host_watch import MIB, Roster, RunDirWatch, free_bytes_at
 from services.recorder.loop import CAPACITY, Recorder, summary
-from services.recorder.snapshot import SnapshotRing
 from shared import log, revision, scheduling
 from shared.bus import topics
 from shared.bus.session import open_session
@@ -46,29 +42,11 @@ DRAIN_PERIOD_S: Final = 0.02
 LAST_WORDS_S: Final = 0.1
 """After a stop, for what other stopping services still have to say."""
 
-SNAPSHOT_MAX_S: Final = 3600.0
-
-
-class _SnapshotRequest:
-    """True once after each SIGUSR1: write the snapshot."""
-
-    def __init__(self) -> None:
-        self._asked = False
-        signal.signal(signal.SIGUSR1, self._ask)
-
-    def _ask(self, _number: int, _frame: FrameType | None) -> None:
-        self._asked = True
-
-    def take(self) -> bool:
-        """Return True if a snapshot was requested since the last call."""
-        asked, self._asked = self._asked, False
-        return asked
-
 
 def main() -> int:
     """Run the recorder; return the exit code."""
     os.umask(0o027)  # a record may be read by the group, and is nobody's to change
-    stop, asked = StopFlag(), _SnapshotRequest()
+    stop = StopFlag()
     logger = log.setup("recorder")
     arguments = _arguments()
     config = load(arguments.config)
@@ -76,7 +54,6 @@ def main() -> int:
     attachments = _attachments(arguments)
     metadata = _metadata(config.name, arguments, config.recorder)
     recorded = _recorded(config.name, arguments.of)
-    snapshot = _snapshot(arguments.snapshot, config.recorder, recorded)
     granted = scheduling.apply("recorder")
     # The bus before the file: an endpoint that is taken leaves no empty file behind.
     name = topics.HOST_RECORDER if arguments.of else topics.RECORDER
@@ -96,19 +73,18 @@ def main() -> int:
                 recording = Recorder(
                     stream, writer, config.recorder, logger,
                     free_bytes=lambda: free_bytes_at(arguments.out), now_ns=now_ns(),
-                    snapshot=snapshot,
                 )  # fmt: skip
-                logger.info("%s, priority %s", _about(writer, snapshot, len(recorded)), granted)
+                logger.info("%s, priority %s", _about(writer, len(recorded)), granted)
                 auto_recovery.start()
                 roster = None if arguments.of else Roster(session)
                 host = RunDirWatch(arguments.run_dir, logger, now_ns())
-                _record(recording, stop, asked, roster, host)
+                _record(recording, stop, roster, host)
         except RunError as error:
             logger.error("%s", error)
             return error.exit_code
         finally:
             auto_recovery.halt()
-    return _tell_end(writer, recording, summary(writer, snapshot), logger)
+    return _tell_end(writer, recording, summary(writer), logger)
 
 
 def _tell_end(writer: RunWriter, recording: Recorder, counts: str, logger: logging.Logger) -> int:
@@ -139,14 +115,11 @@ def _recorded(robot: str, of: tuple[str, ...] | None) -> dict[str, topics.Topic]
 def _record(
     recording: Recorder,
     stop: StopFlag,
-    asked: _SnapshotRequest,
     roster: Roster | None,
     host: RunDirWatch,
 ) -> None:
     """Record until `stop`, then the queued rest."""
     while not stop:
-        if asked.take():
-            recording.trigger("requested by SIGUSR1", now_ns())
         now = now_ns()
         if roster is not None:
             roster.put_if_due(now, tuple(filter(None, (recording.trouble, host.trouble))))
@@ -158,24 +131,11 @@ def _record(
     recording.close()
 
 
-def _about(writer: RunWriter, snapshot: SnapshotRing | None, keys: int) -> str:
-    if snapshot is not None:
-        return f"keeping {keys} keys in memory until there is a fault"
+def _about(writer: RunWriter, keys: int) -> str:
     if not writer.recording:
         return f"waiting for space to record {keys} keys"
     beside = "" if writer.path.name == FIRST else f" ({FIRST} is there already and stays)"
     return f"recording {keys} keys to {writer.path}{beside}"
-
-
-def _snapshot(
-    seconds: float | None, config: RecorderConfig, recorded: dict[str, topics.Topic]
-) -> SnapshotRing | None:
-    if seconds is None:
-        return None
-    if not 0.0 < seconds <= SNAPSHOT_MAX_S:
-        right = f"more than 0 and at most {SNAPSHOT_MAX_S:g} s"
-        raise ConfigError("--snapshot", "SECONDS", f"{seconds:g}", right)
-    return SnapshotRing(seconds, config.snapshot_mib * MIB, recorded)
 
 
 def _arguments() -> argparse.Namespace:
@@ -197,13 +157,6 @@ def _arguments() -> argparse.Namespace:
         default=[],
         metavar="NAME=FILE",
         help="attach a file under a name, for example the generated model (repeatable)",
-    )
-    parser.add_argument(
-        "--snapshot",
-        type=float,
-        metavar="SECONDS",
-        help="write nothing until a module goes to FAULT or DAMP, a steady sender falls silent, "
-        "an emergency stop or SIGUSR1; then SECONDS before and after it",
     )
     return parser.parse_args()
 
@@ -259,7 +212,6 @@ def _metadata(
         "recorder": {
             "flush_ms": f"{config.flush_ms:g}",
             "fsync_s": f"{config.fsync_s:g}",
-            "snapshot_s": "" if arguments.snapshot is None else f"{arguments.snapshot:g}",
         },
     }
 

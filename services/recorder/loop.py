@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Final
 
 from services.recorder.host_watch import MIB, Deadline, DiskChange, SpaceGuard
-from services.recorder.snapshot import SnapshotRing
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import RecorderConfig
 from shared.exceptions import RunError
@@ -15,9 +14,6 @@ from shared.mcap_log.writer import FilePlace, MessageSource, RunWriter
 
 CAPACITY: Final = 65_536
 """Messages that may wait while the disk is slow: 16 s of the fleet."""
-
-SLICE: Final = 8_192
-"""Messages of a snapshot written in one cycle; the bus is emptied in between."""
 
 REPORT_PERIOD_S: Final = 10.0
 
@@ -36,15 +32,13 @@ class Recorder:
         *,
         free_bytes: FreeBytes,
         now_ns: int,
-        snapshot: SnapshotRing | None = None,
     ) -> None:
-        """Look at the disk, and start the first file unless there is a snapshot.
+        """Look at the disk, and start the first file.
 
-        `writer` has no file started; `free_bytes` returns the free space where the run is written;
-        a `snapshot` writes only the messages around a fault. Raises RunError if a file cannot be
-        written, as all methods do.
+        `writer` has no file started; `free_bytes` returns the free space where the run is written.
+        Raises RunError if a file cannot be written, as all methods do.
         """
-        self._source, self._writer, self._snapshot = source, writer, snapshot
+        self._source, self._writer = source, writer
         self._logger, self._free_bytes = logger, free_bytes
         self._config = config
         self._guard = SpaceGuard(config.free_min_mib)
@@ -60,15 +54,11 @@ class Recorder:
         self.trouble = ""
         """Why nothing is recorded now, in words; "" if it is."""
         self._watch_space()
-        if snapshot is None:
-            self._begin(now_ns, {})
+        self._begin(now_ns, {})
 
     def cycle(self, now_ns: int) -> None:
         """Write new messages, and do what is due."""
-        if self._snapshot is None:
-            self._writer.take_from(self._source, CAPACITY)
-        else:
-            self._follow(self._snapshot, now_ns)
+        self._writer.take_from(self._source, CAPACITY)
         flush = self._flush.passed(now_ns)
         if self._sync.passed(now_ns):  # flushes as well
             self._writer.sync()
@@ -79,27 +69,7 @@ class Recorder:
             self._watch_file(now_ns)
             self._split_if_due(now_ns)
         if self._report.passed(now_ns):
-            self._logger.info("%s", summary(self._writer, self._snapshot))
-
-    def trigger(self, reason: str, now_ns: int) -> None:
-        """Have the snapshot written."""
-        if self._snapshot is not None:
-            self._snapshot.trigger(reason, now_ns)
-
-    def _follow(self, snapshot: SnapshotRing, now_ns: int) -> None:
-        """Keep the ring, and write it while a fault asks for it."""
-        snapshot.take_from(self._source, CAPACITY)
-        snapshot.pass_time(now_ns)
-        if not snapshot.writing:
-            if self._writer.recording:
-                self._writer.finish()
-                self._logger.info("snapshot finished: %s", self._writer.path)
-        elif self._guard.enough:
-            if not self._writer.recording:
-                self._begin(now_ns, {"snapshot": snapshot.reason})
-                what = (snapshot.reason, len(snapshot), self._writer.path)
-                self._logger.warning("%s: snapshot of %d messages to %s", *what)
-            self._writer.take_from(snapshot, SLICE)
+            self._logger.info("%s", summary(self._writer))
 
     def _begin(self, now_ns: int, note: dict[str, str]) -> None:
         if self._guard.enough:
@@ -148,8 +118,7 @@ class Recorder:
         self._logger.error(
             "%s was %s while it was written, with %d messages", path, place.value, count
         )
-        if self._snapshot is None:
-            self._why_next = f"the file before was {place.value}"
+        self._why_next = f"the file before was {place.value}"
 
     def _watch_space(self) -> None:
         """Stop before the disk is full, and go on when it no longer is."""
@@ -174,23 +143,17 @@ class Recorder:
             case DiskChange.BACK:
                 self.trouble = ""
                 self._logger.warning("%s: %d MiB free again", where, free // MIB)
-                if self._snapshot is None:
-                    self._why_next = self._why_next or "space again"
+                self._why_next = self._why_next or "space again"
             case DiskChange.NONE:
                 pass
 
     def close(self) -> None:
         """Write the queued rest; the writer finishes the file."""
-        if self._snapshot is None:
-            self._writer.take_from(self._source, CAPACITY)
-        else:
-            self._snapshot.take_from(self._source, CAPACITY)
-            while self._writer.recording and self._writer.take_from(self._snapshot, SLICE):
-                pass
+        self._writer.take_from(self._source, CAPACITY)
         self._leave_if_gone()
 
 
-def summary(writer: RunWriter, snapshot: SnapshotRing | None = None) -> str:
+def summary(writer: RunWriter) -> str:
     """Return the counts in one line."""
     counts = writer.counts.values()
     line = (
@@ -205,8 +168,4 @@ def summary(writer: RunWriter, snapshot: SnapshotRing | None = None) -> str:
             line += f"; {sum(keys.values())} left out, {what}: {', '.join(sorted(keys))}"
     if writer.left_out:
         line += f"; {writer.left_out} left out while no file could be written"
-    if snapshot is not None:
-        line += f"; {len(snapshot)} in memory, {snapshot.memory // MIB} MiB"
-        if snapshot.dropped:
-            line += f", {snapshot.dropped} dropped: recorder.snapshot_mib is too small for them"
     return line

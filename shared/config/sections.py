@@ -485,8 +485,6 @@ class RecorderConfig(Section, frozen=True):
     """Size at which the next file begins; 0: never."""
     free_min_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 256
     """Recording stops while less of the disk is free; 0: only when it is full."""
-    snapshot_mib: Annotated[int, Range(1, 1 << 16, "MiB")] = 256
-    """Memory of `--snapshot`; 3 MiB hold a second of the fleet."""
 
 
 class OperatorConfig(Section, frozen=True):

@@ -13,26 +13,21 @@ import pytest
 from services.recorder import __main__ as recorder
 from services.recorder.host_watch import MIB
 from services.recorder.loop import Recorder
-from services.recorder.snapshot import SnapshotRing
-from shared.bus import codec, topics
-from shared.bus.messages import JointEvent, Mode
+from shared.bus import topics
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import RecorderConfig
 from shared.mcap_log.writer import RunWriter
 from tests.shared.mcap_log import runs
-from tests.shared.mcap_log.runs import ROBOT, STATE_KEY, Queue, item
+from tests.shared.mcap_log.runs import STATE_KEY, Queue, item
 from tools.logs.run_log import read_run
 
 CYCLE_NS = 20 * NS_PER_MS
-EVENT_KEY = topics.JOINT_EVENT.key(ROBOT, "knee_right")
 
 
 class Rig:
     """A recording of ten messages a cycle; each is stamped when it comes."""
 
-    def __init__(
-        self, out: Path, config: RecorderConfig, snapshot: SnapshotRing | None, free: int
-    ) -> None:
+    def __init__(self, out: Path, config: RecorderConfig, free: int) -> None:
         self.now_ns = 0
         self.free = free
         self.sent = 0
@@ -45,7 +40,6 @@ class Rig:
             logging.getLogger("test"),
             free_bytes=lambda: self.free,
             now_ns=0,
-            snapshot=snapshot,
         )
 
     def run(self, seconds: float) -> None:
@@ -63,10 +57,9 @@ class Rig:
         self.writer.__exit__(None, None, None)
 
 
-def rig(out: Path, *, snapshot_s: float = 0.0, free: int = 10_000 * MIB, **changes: float) -> Rig:
+def rig(out: Path, *, free: int = 10_000 * MIB, **changes: float) -> Rig:
     settings = {"chunk_kib": 64, "flush_ms": 250.0, "fsync_s": 1.0, "free_min_mib": 100}
-    ring = SnapshotRing(snapshot_s, 1 << 28, topics.recorded_keys(ROBOT)) if snapshot_s else None
-    return Rig(out, RecorderConfig(**settings | changes), ring, free)  # type: ignore[arg-type]
+    return Rig(out, RecorderConfig(**settings | changes), free)  # type: ignore[arg-type]
 
 
 def seqs(path: Path) -> list[int]:
@@ -142,33 +135,6 @@ def test_short_of_space_it_warns_stops_with_a_finished_file_and_goes_on_later(
     assert left_out > 0
     assert f"{left_out} messages were left out" in caplog.text
     assert read_run(tmp_path / "run_1.mcap").metadata["split"]["why"] == "space again"
-
-
-def fault(now_ns: int) -> tuple[str, bytes, int]:
-    payload = codec.encode(runs.sample(JointEvent, mode_after=Mode.FAULT, t_ns=now_ns))
-    return EVENT_KEY, payload, now_ns
-
-
-def test_a_snapshot_writes_nothing_until_a_fault_and_then_before_and_after(tmp_path: Path) -> None:
-    run = rig(tmp_path, snapshot_s=2.0)
-    run.run(10.0)
-    assert list(tmp_path.iterdir()) == []
-    run.queue.items.append(fault(run.now_ns))
-    run.run(10.0)
-    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
-    found = seqs(tmp_path / "run.mcap")
-    assert found == list(range(found[0], found[-1] + 1))
-    assert found[0] == pytest.approx(5000 - 1000, abs=20)
-    assert found[-1] == pytest.approx(5000 + 1000, abs=20)
-    log = read_run(tmp_path / "run.mcap")
-    assert log.metadata["split"]["snapshot"] == f"{EVENT_KEY}: FAULT"
-    assert log.received_ns(topics.JOINT_STATE, "knee_right")[0] == pytest.approx(
-        8 * NS_PER_S, abs=NS_PER_S // 20
-    )
-    run.queue.items.append(fault(run.now_ns))
-    run.run(1.0)
-    run.finish()
-    assert seqs(tmp_path / "run_1.mcap")[-1] == run.sent - 1, "a stop finishes it"
 
 
 def test_a_folder_that_is_removed_is_told_at_once_and_recording_goes_on_in_the_next_file(

@@ -22,7 +22,6 @@ from shared.bus.traces import JointTrace
 from shared.config.files import load
 from shared.exceptions import RunError
 from shared.places import DEFAULT_CONFIG
-from shared.run_directory import live_dir
 from tests.messages import sample
 from tests.shared.mcap_log import runs
 from tests.waiting import comes_true
@@ -169,27 +168,6 @@ def test_sigkill_loses_less_than_a_second_and_the_next_recorder_recovers_the_res
     assert rig.process.returncode == 0, output
     assert f"{rig.path} was not finished; recovered to run.mcap" in output
     assert [p.name for p in sorted(rig.out.iterdir())] == ["run-1.mcap", "run.mcap"]
-
-
-def test_a_snapshot_is_written_when_asked_for_and_holds_what_was_before() -> None:
-    with rig_with("--snapshot", "30") as rig:
-        wait_for((live_dir(rig.run_dir) / "recorder.zenoh").exists)
-        for _ in range(50):
-            rig.send(20)
-            time.sleep(0.01)
-        assert not rig.out.exists()
-        rig.process.send_signal(signal.SIGUSR1)
-        wait_for(rig.hears)
-        target = rig.sent
-        rig.send(100)
-        output = rig.stop(signal.SIGTERM)
-        assert rig.process.returncode == 0, output
-        log = read_run(rig.path)
-        assert log.complete
-        found = [m.seq for m in states(log)]
-        assert found == list(range(found[0], rig.sent))
-        assert len(found) > target // 2
-        assert log.metadata["split"]["snapshot"] == "requested by SIGUSR1"
 
 
 def test_a_write_error_ends_with_exit_code_2_and_one_line(rig: Rig) -> None:

@@ -184,10 +184,9 @@ class ScenarioRunner:
         self._armed = _ArmedKill(triggered_kill)
         self._events = _RunEvents(session)
         self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
-        self._states = {
-            module: session.latest_in_batch(topics.JOINT_STATE, JointState, module)
-            for module in MODULES
-        }
+        # a triggered kill follows the modes closely; a batch is up to 20 ms old
+        subscribe = session.latest_in_batch if triggered_kill is None else session.latest
+        self._states = {m: subscribe(topics.JOINT_STATE, JointState, m) for m in MODULES}
         self._planner: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._control = session.publisher(topics.SIM_CONTROL, SimControl)
         self._truth: SimTruth | None = None

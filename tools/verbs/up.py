@@ -19,7 +19,7 @@ from shared.config import gain_schedule
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import BusError, FleetError, RunError
 from shared.joints import MODULES
-from tools.flags import Arg, ConfigFlags, Folder, Number, RunDirFlags, names_of, parsed
+from tools.flags import Arg, ConfigFlags, Folder, RunDirFlags, names_of, parsed
 from tools.fleet.fleet_status import OPEN
 from tools.fleet.pace import PaceFlags
 from tools.fleet.process_table import FleetOptions, check_known, is_simulated, load_table
@@ -69,8 +69,6 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
     ] = None
     """start only these: the other services run on other hosts, at their endpoints in the robot
     file"""
-    snapshot: Annotated[Number | None, Arg(metavar="SECONDS")] = None
-    """record nothing until a fault, then SECONDS before and after it"""
     no_planner: bool = False
     """start no planner: the six modules HOLD; `xrl start planner` starts it later"""
     injectable: bool = False
@@ -110,7 +108,6 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
         for option, is_given, service in (
             ("--scenario", self.scenario is not None, "simulator"),
             ("--plant", bool(self.plant), "simulator"),
-            ("--snapshot", self.snapshot is not None, "recorder"),
             ("--injectable", self.injectable, "planner"),
             ("--controller", self.controller is not None, "planner"),
         ):
@@ -211,8 +208,6 @@ def _overrides(flags: UpFlags, out: Path) -> dict[str, list[str]]:
             "--attach",
             f"{ATTACHED}={split_spec(flags.controller)[0].absolute()}",
         ]
-    if flags.snapshot is not None:
-        overrides["recorder"] += ["--snapshot", f"{flags.snapshot:g}"]
     if HOST_RECORDER in (flags.only or ()):
         overrides[HOST_RECORDER] = [*overrides["recorder"], "--of", _of_host(flags.only)]
     if flags.readonly:

@@ -43,7 +43,6 @@ REFUSALS: Final = {
     "up --only host_recorder": "beside services of its own",
     "up --no-sim --scenario squat": "--scenario is for the simulator, and --no-sim starts none",
     "up --only planner --plant ideal": "--plant is for the simulator, and --only starts none",
-    "up --only planner,harness --snapshot 3": "--snapshot is for the recorder",
     "up --only harness --injectable": "--injectable is for the planner",
     "up --accept estop": "--accept is for the gateway to ROS 2: add --ros2",
     "status": "no fleet is up in",

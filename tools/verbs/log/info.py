@@ -154,9 +154,6 @@ def _show_run(survey: Survey, console: Console) -> None:
     if about.get("git_commit"):
         dirty = " with changes" if about.get("git_dirty") == "true" else ""
         grid.add_row("git commit", printable(about["git_commit"]) + dirty)
-    split = file.metadata.get("split", {})
-    if split.get("snapshot"):
-        grid.add_row("snapshot", printable(split["snapshot"]))
     if file.attachments:
         sizes = ", ".join(f"{name} ({size} bytes)" for name, size in file.attachments.items())
         grid.add_row("attachments", printable(sizes))
