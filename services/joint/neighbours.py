@@ -49,8 +49,6 @@ do only where other processors see stores in their order; Arm does not promise t
 READS: Final = 5
 """Reads of a row until it is whole; its writer may have died over it."""
 _SIZE: Final = N_MODULES * _ROW.size
-_BODIES: Final = range(_SUM.size, _SIZE, _ROW.size)
-"""Where each row begins behind its checksum."""
 
 
 class NeighbourRow(NamedTuple):
@@ -181,12 +179,11 @@ class Neighbours:
 
     def view(self, now_ns: int) -> NeighbourView:
         """Return what this module knows of the others."""
-        data = self._memory[:]
-        rows = [  # a row that was being written is None; the next cycle is 2 ms away
-            NeighbourRow(*row) if checksum == crc32(data[at : at + _BODY.size]) else None
-            for at, (checksum, *row) in zip(_BODIES, _ROW.iter_unpack(data), strict=True)
-        ]
-        return view_of(self._module, rows, now_ns)
+        return view_of(self._module, [self._read(at) for at in range(0, _SIZE, _ROW.size)], now_ns)
+
+    def _read(self, at: int) -> NeighbourRow | None:
+        row, whole = _unpacked(self._memory[at : at + _ROW.size])
+        return row if whole else None  # written meanwhile; the next cycle is 2 ms away
 
 
 def _unpacked(data: bytes) -> tuple[NeighbourRow, bool]:

@@ -121,8 +121,6 @@ class StallWatch:
     """A timer thread beside a fleet, in real time where that is allowed."""
 
     def __init__(self) -> None:
-        self.newest: Stall | None = None
-        """As `take` returned it."""
         self._gaps: deque[tuple[int, int]] = deque()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="stalls", daemon=True)
@@ -141,9 +139,7 @@ class StallWatch:
         """Return the stalls since the last call, by the fleet's clock."""
         rate, gaps = pace(), [self._gaps.popleft() for _ in range(len(self._gaps))]
         found = [Stall(int(rate * begin_ns), int(rate * end_ns)) for begin_ns, end_ns in gaps]
-        found = [stall for stall in found if stall.end_ns - stall.begin_ns > GAP_NS]
-        self.newest = found[-1] if found else self.newest
-        return found
+        return [stall for stall in found if stall.end_ns - stall.begin_ns > GAP_NS]
 
     def _watch(self) -> None:
         with suppress(PermissionError):  # of this thread alone

@@ -58,11 +58,10 @@ class LiveView:
         if now < self._next_s or snapshot.truth is None:
             return
         self._next_s = now + self._period_s
-        words = (
-            snapshot.note,
-            active(self._injects, snapshot.truth.scenario_s),
-            *said_by(self._hear(now)),
-        )
+        status = self._hear(now)
+        words = [snapshot.note, active(self._injects, snapshot.truth.scenario_s)]
+        if snapshot.truth.hoist == 0.0:  # of a hanging robot it only says that it hangs
+            words += said_by(status)
         note = "; ".join(word for word in words if word)
         self._print(Text(_line(snapshot.truth, snapshot.modes, note)))
 

@@ -75,12 +75,12 @@ def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says(
 
 def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     runner = object.__new__(ScenarioRunner)
-    runner._stalls, runner._killed = StallWatch(), False
+    runner._stall, runner._killed = Stall(0, 0), False
     runner._modes, runner._held = dict.fromkeys(MODULES, Mode.TRACK), len(MODULES)
     runner._note = ""
     assert runner._stall_words() == ""
     now = now_ns()
-    runner._stalls.newest = Stall(now - ms(63), now)
+    runner._stall = Stall(now - ms(63), now)
     words = "the machine stalled for 63 ms"
     assert runner._stall_words() == f"{words}: all six held", "though they track again"
     runner._killed = True
@@ -88,7 +88,7 @@ def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     runner._note = STARTING
     assert runner._stall_words() == "", "services that start take the machine's time"
     runner._note = ""
-    runner._stalls.newest = Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S))
+    runner._stall = Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S))
     assert runner._stall_words() == ""
 
 

@@ -187,10 +187,13 @@ class Planner:
 def test_the_line_shows_what_is_done_what_the_planner_says_and_how_long_it_waits() -> None:
     text = io.StringIO()
     view = LiveView(Console(file=text, width=300), INJECTS, Planner())
-    truth = sample(SimTruth, seq=1, t_ns=1, scenario_s=3.5)
     with view:
-        view.show(LiveSnapshot(truth, ("T",) * 6, "push"))
-    line = text.getvalue().strip()
-    assert line.endswith(
+        for hoist in (0.2, 0.0):  # what the planner says of a hanging robot is left out
+            truth = sample(SimTruth, seq=1, t_ns=1, scenario_s=3.5, hoist=hoist)
+            view._next_s = 0.0
+            view.show(LiveSnapshot(truth, ("T",) * 6, "push"))
+    hangs, stands = text.getvalue().strip().splitlines()
+    assert hangs.endswith("TTTTTT  push; planner->joints delay=30ms")
+    assert stands.endswith(
         "TTTTTT  push; planner->joints delay=30ms; knee_left is hot; leads again in 3 s"
     )
