@@ -121,6 +121,10 @@ class StallWatch:
     """A timer thread beside a fleet, in real time where that is allowed."""
 
     def __init__(self) -> None:
+        self.longest = Stall(0, 0)
+        """The longest of the last moments; (0, 0) before the first."""
+        self.held = 0
+        """The most modules in HOLD at once since then."""
         self._gaps: deque[tuple[int, int]] = deque()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="stalls", daemon=True)
@@ -139,7 +143,19 @@ class StallWatch:
         """Return the stalls since the last call, by the fleet's clock."""
         rate, gaps = pace(), [self._gaps.popleft() for _ in range(len(self._gaps))]
         found = [Stall(int(rate * begin_ns), int(rate * end_ns)) for begin_ns, end_ns in gaps]
-        return [stall for stall in found if stall.end_ns - stall.begin_ns > GAP_NS]
+        found = [stall for stall in found if stall.end_ns - stall.begin_ns > GAP_NS]
+        for stall in found:
+            if not self.is_recent(stall.end_ns) or stall.lasted_ms >= self.longest.lasted_ms:
+                self.longest, self.held = stall, 0
+        return found
+
+    def is_recent(self, now_ns: int) -> bool:
+        """Return True if the longest stall is still to be shown."""
+        return self.longest.end_ns > 0 and now_ns - self.longest.end_ns <= STALL_SHOWN_NS
+
+    def note_held(self, count: int) -> None:
+        """Count the modules that are in HOLD now."""
+        self.held = max(self.held, count)
 
     def _watch(self) -> None:
         with suppress(PermissionError):  # of this thread alone

@@ -33,7 +33,7 @@ from shared.joints import MODULES
 from tools.fleet import procfs
 from tools.fleet.pace import IDLE_LEAST, PACE_MIN, CoresFullError, idle_and_total, idle_share
 from tools.fleet.proxy_client import ProxyClient
-from tools.fleet.stalls import STALL_SHOWN_NS, Stall, StallWatch
+from tools.fleet.stalls import Stall, StallWatch
 from tools.fleet.supervise import SupervisedFleet
 
 READY_TIMEOUT_S: Final = 45.0
@@ -197,10 +197,6 @@ class ScenarioRunner:
         self._pids: dict[str, int] = {}
         self._next_pids_s = 0.0
         self._stalls = StallWatch()
-        self._stall = Stall(0, 0)
-        """The longest of the last moments."""
-        self._held = 0
-        """The most modules in HOLD at once since then."""
         self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
@@ -360,24 +356,18 @@ class ScenarioRunner:
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
         stalls = self._stalls.take()
-        for stall in stalls:
-            if not self._shows_stall() or stall.lasted_ms >= self._stall.lasted_ms:
-                self._stall, self._held = stall, 0
-        self._held = max(self._held, list(self._modes.values()).count(Mode.HOLD))
+        self._stalls.note_held(list(self._modes.values()).count(Mode.HOLD))
         if self._note != STARTING:  # services that start take the machine's time
             self._events.tell(stalls)
 
-    def _shows_stall(self) -> bool:
-        """Return True if the stall that is shown was a moment ago."""
-        return self._stall.end_ns > 0 and now_ns() - self._stall.end_ns <= STALL_SHOWN_NS
-
     def _stall_words(self) -> str:
         """Return what to show of the longest stall of the last moments; empty if there was none."""
-        if not self._shows_stall() or self._note == STARTING:
+        stalls = self._stalls
+        if not stalls.is_recent(now_ns()) or self._note == STARTING:
             return ""
-        who = "all six" if self._held == len(MODULES) else self._held
-        by_it = f": {who} held" if self._held and not self._killed else ""
-        return f"{self._stall.words}{by_it}"
+        who = "all six" if stalls.held == len(MODULES) else stalls.held
+        by_it = f": {who} held" if stalls.held and not self._killed else ""
+        return f"{stalls.longest.words}{by_it}"
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
         """Do what is due; the simulator does pushes and faults, and they are only recorded here."""

@@ -75,12 +75,15 @@ def test_in_slow_motion_a_stall_is_as_long_as_the_fleets_clock_says(
 
 def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     runner = object.__new__(ScenarioRunner)
-    runner._stall, runner._killed = Stall(0, 0), False
-    runner._modes, runner._held = dict.fromkeys(MODULES, Mode.TRACK), len(MODULES)
-    runner._note = ""
+    runner._stalls, runner._killed, runner._note = StallWatch(), False, ""
     assert runner._stall_words() == ""
     now = now_ns()
-    runner._stall = Stall(now - ms(63), now)
+    runner._stalls._gaps += [(now - ms(93), now - ms(30))]
+    runner._stalls.take()
+    for held in (2, 6, 0):
+        runner._stalls.note_held(held)
+    runner._stalls._gaps += [(now - ms(26), now)]
+    runner._stalls.take()
     words = "the machine stalled for 63 ms"
     assert runner._stall_words() == f"{words}: all six held", "though they track again"
     runner._killed = True
@@ -88,7 +91,7 @@ def test_the_live_line_marks_a_stall_and_forgets_it_after_moments() -> None:
     runner._note = STARTING
     assert runner._stall_words() == "", "services that start take the machine's time"
     runner._note = ""
-    runner._stall = Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S))
+    runner._stalls.longest = Stall(now - 3 * NS_PER_S, now - round(2.5 * NS_PER_S))
     assert runner._stall_words() == ""
 
 

@@ -24,16 +24,21 @@ from shared.toml_file import Range
 from tools.flags import Arg
 from tools.fleet.pace import PACE_MIN
 from tools.fleet.status_table import warn_of_others
+from tools.lab.bench import bus
 from tools.lab.bench.table import AgainstFlags, Figure, Turn, finish, row_of, run_tree, run_turns
 from tools.logs.run_log import RunLog, read_run
 from tools.terminal import Console
 
 FIRST_USE: Final = "first_use_ms"
 """Ages of commands, which this bench reads from the record."""
+OVER_FLOOR: Final = "cpu_over_floor"
+"""CPU of the fleet over that of seven processes that only exchange its messages, `bench bus`."""
+FLOOR_S: Final = 8.0
 FIGURES: Final = {
     ("planner_tick_us", "median"): Figure("tick, median", "us", 300.0),
     ("planner_tick_us", "p99"): Figure("tick, p99", "us"),
     ("fleet_cpu_pct",): Figure("CPU, all processes", "%", 110.0),
+    (OVER_FLOOR,): Figure("CPU, over that of the messages alone", "", 2.0),
     ("pd_cycles_late_pct",): Figure("PD cycles late", "%", 0.5),
     (FIRST_USE, "median"): Figure("age at first use, median", "ms"),
     (FIRST_USE, "p99"): Figure("age at first use, p99", "ms", 3.0),
@@ -69,7 +74,8 @@ def run(flags: FleetFlags) -> int:
     ]
     note = (
         "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
-        "Age: of a command, from the module's state that it answers to the cycle that takes it."
+        "Age: of a command, from the module's state that it answers to the cycle that takes it. "
+        "Messages alone: `xrl bench bus --transport zenoh`, without laws, drives and a recorder."
     )
     return finish(flags, [row_of(figure, here, there) for figure in kept], note, console)
 
@@ -84,6 +90,7 @@ def measure(demo: Sequence[str]) -> Turn:
         out = Path(folder) / "run"
         run_tree(CHECKOUT, [*demo, "--out", str(out)])
         summary = msgspec.json.decode((out / "summary.json").read_bytes())
+        summary[OVER_FLOOR] = summary["fleet_cpu_pct"] / bus.measure("zenoh", FLOOR_S)["CPU %"]
         return figures(summary, first_use_ms(read_run(out)))
 
 
