@@ -168,7 +168,7 @@ IMPURE = {
 LINES_MAX = 600
 """A file has one reason to change, and its length follows; one as long as this has two."""
 
-FOLDERS = {"services", "shared", "deploy", "tests", "tools", "docs", "examples", ".ci"}
+FOLDERS = {"services", "shared", "deploy", "tests", "tools", "docs", "examples", "findings", ".ci"}
 
 
 def service_of(file: str) -> str:
