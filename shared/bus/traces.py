@@ -126,12 +126,14 @@ class SimTruth(Message, frozen=True):
     """Centre of pressure on the right sole, x and y, m, world; (0, 0) if it bears nothing."""
     foot_left_cop: Pair = (0.0, 0.0)
     """m"""
+    feet: Pair = (0.0, 0.0)
+    """How far the midpoint of the ankles has moved since the start, x and y, m, world."""
 
     @property
     def over(self) -> Pair:
-        """Where the COM is over by gravity, at the ankles' height: x and y, m, world."""
+        """Where the COM is over by gravity, x and y, m, world, from the midpoint of the ankles."""
         x, y, z = self.com
-        return x - self.lean[0] * z, y - self.lean[1] * z
+        return x - self.feet[0] - self.lean[0] * z, y - self.feet[1] - self.lean[1] * z
 
 
 class SimState(Message, frozen=True):

@@ -20,14 +20,18 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import os
 import secrets
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, BinaryIO, Final, Protocol
 
+import mcap.writer
 import msgspec
+import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Schema
 from mcap.well_known import MessageEncoding
@@ -36,10 +40,16 @@ from mcap.writer import CompressionType, Writer
 from shared.bus.topics import Topic, several_may_write
 from shared.exceptions import RunError
 from shared.mcap_log import files, schema
+from shared.mcap_log.records import ZSTD_LEVEL
 from shared.mcap_log.sequence_stats import KeyCount
 
-SCHEMA_VERSION: Final = "6"
+SCHEMA_VERSION: Final = "7"
 """Version of the layout above and of the messages in `shared/bus/messages.py`."""
+
+# mcap's writer has no option for the level
+mcap.writer.zstandard = SimpleNamespace(  # type: ignore[assignment, attr-defined]
+    compress=functools.partial(zstandard.compress, level=ZSTD_LEVEL)
+)
 
 PROFILE: Final = "xrl"
 COUNTS: Final = "counts"

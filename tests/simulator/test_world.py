@@ -56,6 +56,9 @@ def test_at_the_start_it_stands_level_where_the_planner_assumes_it(robot: RobotC
     assert truth.com[:2] == pytest.approx((0.0, 0.0), abs=1e-3)
     assert max(truth.foot_right_tilt, truth.foot_left_tilt) < 2e-3
     assert not truth.fallen
+    world.placement.ankles += (0.2, 0.05, 0.0)
+    assert seen(world).feet == pytest.approx((-0.2, -0.05), abs=1e-3)
+    world.placement.ankles -= (0.2, 0.05, 0.0)
     for side, sign in zip(SIDES, (-1.0, 1.0), strict=True):
         foot = world.data.body(f"foot_{side}")
         wanted = (0.0, sign * robot.geometry.w_base / 2, 0.0)

@@ -33,7 +33,8 @@ STICTION_TIME = 0.004
 
 MuJoCo leaves the term dJ/dt v out of a contact's acceleration. A sole under a turning leg therefore
 creeps, by the leg's centripetal acceleration times about half of this time. With the contact's own
-20 ms the feet crept back by 1.9 mm a squat, at any time step and `impratio`; now by 0.16 mm.
+20 ms the feet crept back by 1.9 mm a squat, at any time step and `impratio`; now by 0.3 mm. So
+`SimTruth.over` is measured from where the feet are.
 """
 
 

@@ -41,6 +41,8 @@ class MeasuredPosture(NamedTuple):
     """Tilt of the right and the left sole against the floor, rad."""
     slip: float
     """Largest distance of a foot from its place, m."""
+    feet: Pair
+    """Mean distance of the two from their places, x and y, m."""
 
     @property
     def fallen(self) -> bool:
@@ -69,13 +71,14 @@ def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -
     roll = math.asin(clamp(rotation[2, 1], -1.0, 1.0))
     pitch = math.atan2(-rotation[2, 0], rotation[2, 2])
     yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
-    positions = np.array([data.xpos[foot] for foot in feet])
+    moved = np.array([data.xpos[foot] for foot in feet]) - ankles
     return MeasuredPosture(
         com=as_vector(data.subtree_com[0]),
         torso=as_vector(data.xpos[torso]),
         angles=(roll, pitch, yaw),
         tilts=[math.acos(min(1.0, data.xmat[foot][8])) for foot in feet],
-        slip=float(np.linalg.norm(positions - ankles, axis=1).max()),
+        slip=float(np.linalg.norm(moved, axis=1).max()),
+        feet=(float(moved[:, 0].mean()), float(moved[:, 1].mean())),
     )
 
 

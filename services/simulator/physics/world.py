@@ -254,6 +254,7 @@ class World:
             foot_left_force=left.force,
             foot_right_cop=right.cop,
             foot_left_cop=left.cop,
+            feet=posture.feet,
         )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.stream_reader import StreamReader
@@ -13,6 +14,7 @@ from mcap.stream_reader import StreamReader
 from shared.bus import codec, topics
 from shared.exceptions import RunError
 from shared.mcap_log import files
+from shared.mcap_log.records import ZSTD_LEVEL
 from tests.messages import sample
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import (
@@ -39,6 +41,8 @@ def test_metadata_and_attachments_come_before_the_first_chunk(tmp_path: Path) ->
     assert len(names) + len(described) == len(head)
     topics_described = {r.topic for r in described if isinstance(r, Channel)}
     assert topics_described == set(topics.recorded_keys(runs.ROBOT))
+    rows = records[first_chunk].data
+    assert rows == zstandard.compress(zstandard.decompress(rows), ZSTD_LEVEL), "not mcap's level"
 
 
 def leaves(value: Any) -> Iterator[Any]:

@@ -46,6 +46,15 @@ def test_a_robot_upright_on_its_soles_stands(robot: RobotConfig, upright: SimTru
     assert why_not_standing(upright, robot) == ""
 
 
+def test_feet_that_have_crept_for_an_hour_take_the_com_with_them(
+    robot: RobotConfig, upright: SimTruth
+) -> None:
+    """A squat moves them by 0.3 mm: after an hour a robot that stood counted as fallen."""
+    crept = msgspec.structs.replace(upright, com=(-0.25, 0.0, 1.0), feet=(-0.25, 0.0))
+    assert crept.over == pytest.approx((0.0, 0.0), abs=2e-3)
+    assert why_not_standing(crept, robot) == ""
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
