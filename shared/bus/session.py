@@ -108,8 +108,8 @@ def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
 class _BatchSender:
     """Puts what a service publishes once more, for the recorder, many messages at a time.
 
-    A recorder that subscribes to each key is woken for each message, and Zenoh's thread with it at
-    both ends.
+    A recorder that subscribed to each key would be woken for each message, and so would Zenoh's
+    thread at both ends.
     """
 
     def __init__(self, put: _Put) -> None:
