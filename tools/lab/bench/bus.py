@@ -34,6 +34,7 @@ from shared.extras import late
 from shared.joints import MODULES
 from shared.places import DEFAULT_CONFIG
 from tools.flags import Arg, Duration
+from tools.fleet.status_table import warn_of_others
 from tools.lab.bench.table import BenchFlags, print_table, write_rows
 from tools.terminal import Console
 
@@ -278,6 +279,8 @@ class BusFlags(BenchFlags):
 
 def run(flags: BusFlags) -> int:
     """Measure the transports in turn and print their medians."""
+    console = Console()
+    warn_of_others(console)  # these processes have a joint service's priority, and would hold it up
     names = flags.transport or [
         name for name, (_, package) in TRANSPORTS.items() if importlib.util.find_spec(package)
     ]
@@ -291,7 +294,7 @@ def run(flags: BusFlags) -> int:
     ]
     columns = {key: [f"{row[key]:.2f}" for row in rows] for key in rows[0] if key != "transport"}
     print_table(
-        Console(),
+        console,
         {"": list(names)} | columns,
         "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. Missed: a "
         "command came a cycle later than it could have. CPU: of all processes, of one core.",
