@@ -19,7 +19,7 @@ def main(path: Path) -> None:
     log = read_run(path)
     truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
     t = np.array([row.scenario_s for row in truth])  # (n,), s
-    com = np.array([row.com for row in truth])  # (n, 3), m, world
+    com = np.array([row.over for row in truth])  # (n, 2), m, from the midpoint of the ankles
     states = log.messages(topics.JOINT_STATE, "knee_left")
     age = np.array([row.age_ns for row in states if row.age_ns >= 0]) / 1e6  # ms
     print(f"{t[-1]:.1f} s, COM x {1e3 * com[:, 0].min():.1f} .. {1e3 * com[:, 0].max():.1f} mm")

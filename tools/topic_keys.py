@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 
 from shared.bus import topics
 from shared.bus.topics import Topic
+from shared.bus.traces import Batch
 from shared.config.robot_config import SERVICES
 from shared.exceptions import RunError
 from shared.joints import MODULES
@@ -33,10 +34,11 @@ class TopicKey(NamedTuple):
 
 
 def every_key() -> list[TopicKey]:
-    """Return every key, in the order of the table of topics."""
+    """Return every key but those of batches, whose messages have keys of their own, in order."""
     return [
         TopicKey(topic, module)
         for topic in topics.TOPICS
+        if topic.type is not Batch
         for module in (MODULES if topic.per_module else ("",))
     ]
 

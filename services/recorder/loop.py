@@ -12,8 +12,8 @@ from shared.config.sections import RecorderConfig
 from shared.exceptions import RunError
 from shared.mcap_log.writer import FilePlace, MessageSource, RunWriter
 
-CAPACITY: Final = 65_536
-"""Messages that may wait while the disk is slow: 16 s of the fleet."""
+_AT_ONCE: Final = 65_536
+"""Messages written in one cycle; the rest waits for the next."""
 
 REPORT_PERIOD_S: Final = 10.0
 
@@ -58,7 +58,7 @@ class Recorder:
 
     def cycle(self, now_ns: int) -> None:
         """Write new messages, and do what is due."""
-        self._writer.take_from(self._source, CAPACITY)
+        self._writer.take_from(self._source, _AT_ONCE)
         flush = self._flush.passed(now_ns)
         if self._sync.passed(now_ns):  # flushes as well
             self._writer.sync()
@@ -149,7 +149,7 @@ class Recorder:
 
     def close(self) -> None:
         """Write the queued rest; the writer finishes the file."""
-        self._writer.take_from(self._source, CAPACITY)
+        self._writer.take_from(self._source, _AT_ONCE)
         self._leave_if_gone()
 
 

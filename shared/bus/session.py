@@ -82,6 +82,8 @@ _PRIORITIES: Final = {
 }
 _BATCH_MAX: Final = 64
 """Messages in a batch, if none of them closes it."""
+_RECORDING_WAITS_S: Final = 16.0
+"""Messages that may wait while the disk is slow, s at their rate: 60 MB of the fleet."""
 _ALIVE_TIMEOUT_S: Final = 0.2
 _TOOLS_MAX: Final = 128
 """Tools that are named: as many as there may be links."""
@@ -267,7 +269,8 @@ class Recording(Stream):
     def take(self) -> tuple[str, bytes, int] | None:
         """Return (key, payload, time in monotonic ns) of the oldest message, or None.
 
-        A message in a batch whose sender may not put it is left out.
+        A message whose sender may not put it is left out of its batch; a malformed batch comes as
+        it is, and the recorder counts its key as unknown.
         """
         while not self._waiting:
             sample = super().take()
@@ -275,8 +278,9 @@ class Recording(Stream):
                 return sample
             allowed = self._keys_by_batch[sample[0]]
             batch = self._decoder.decode(sample[1])
-            if batch is not None:
-                self._waiting.extend((k, bytes(raw)) for k, raw in batch.messages if k in allowed)
+            if batch is None:
+                return sample
+            self._waiting.extend((k, bytes(raw)) for k, raw in batch.messages if k in allowed)
         return *self._waiting.popleft(), now_ns()
 
 
@@ -334,9 +338,10 @@ class Session:
 
         Takes up to one lease if a peer is stopped; never raises.
         """
-        with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
-            for batch in self._batches.values():
+        for batch in self._batches.values():
+            with contextlib.suppress(zenoh.ZError):
                 batch.send()
+        with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
     def publisher(self, topic: Topic, message_type: type[M], module: str = "") -> Publisher[M]:
@@ -387,10 +392,7 @@ class Session:
     def latest_in_batch(
         self, topic: Topic, message_type: type[M], module: str = ""
     ) -> LatestInBatch[M]:
-        """As `latest`, for a tool that only shows: the service sends nothing more for it.
-
-        The message comes when its batch does.
-        """
+        """As `latest`, out of the recorder's batches: showing it costs the service nothing."""
         key = self._key(topic, message_type, module)
         if topic.batch is None:
             raise BusError(f"{topic.name}: is in no batch; use `latest`")
@@ -408,12 +410,15 @@ class Session:
         except zenoh.ZError as error:
             raise BusError(f"{', '.join(key_expressions)}: {_reason(error)}") from None
 
-    def recording(self, capacity: int) -> Recording:
-        """Declare subscribers of all that is recorded; `capacity` samples wait for each key."""
-        in_batches = topics.keys_by_batch(self.robot)
-        direct = [t for t in topics.TOPICS if t.recorded and t.batch is None]
-        keys = (*in_batches, *(t.key(self.robot, "*") for t in direct))
-        return Recording([_ring(self._session, key, capacity) for key in keys], in_batches)
+    def recording(self) -> Recording:
+        """Declare subscribers of all that is recorded."""
+        in_batches, every = topics.keys_by_batch(self.robot), topics.all_keys(self.robot)
+        keys = [k for k, t in every.items() if k in in_batches or (t.recorded and not t.batch)]
+        waiting = [max(1000, round(_RECORDING_WAITS_S * every[key].rate_hz)) for key in keys]
+        return Recording(
+            [_ring(self._session, key, most) for key, most in zip(keys, waiting, strict=True)],
+            in_batches,
+        )
 
     def alive(self) -> set[str]:
         """Return the services that this process has a link with, and itself if it is one.

@@ -70,7 +70,7 @@ JOINT_BATCH: Final = Topic(
 )  # fmt: skip
 PLANNER_BATCH: Final = Topic(
     "planner/batch", traces.Batch, 250.0, _DATA, ("planner",), (),
-    "commands, status and checkpoint of a tick, for the recorder", recorded=False,
+    "commands and status of a tick, and checkpoints, for the recorder", recorded=False,
 )  # fmt: skip
 JOINT_STATE: Final = Topic(
     "joint/*/state", messages.JointState, 250.0, _REAL_TIME, ("*",), ("planner",),

@@ -318,7 +318,7 @@ class Recorded:
         self.traces = joint.publisher(topics.JOINT_TRACE, JointTrace, MODULE)
         self.batches = joint.publisher(topics.JOINT_BATCH, Batch, MODULE)
         self.shown = tool.latest_in_batch(topics.JOINT_STATE, JointState, MODULE)
-        self._recording = recorder.recording(1000)
+        self._recording = recorder.recording()
         self.taken: list[tuple[str, int]] = []
         assert comes_true(lambda: self.traces.put(sample(JointTrace, seq=0)) and self.take())
         time.sleep(0.2)  # what was under way has come

@@ -68,7 +68,7 @@ def stamped(
     """Yield time, monotonic ns of the recorder's clock, and message of a key.
 
     The time is the sender's stamp. Where that is more than a second off, because the sender is on
-    another host or had none yet, it is the reception, which is up to 20 ms late. `margins` are the
+    another host or had none yet, it is the reception, which is up to 40 ms late. `margins` are the
     messages before and behind the part.
     """
     received = log.received_ns(topic, module)

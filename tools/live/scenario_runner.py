@@ -357,7 +357,9 @@ class ScenarioRunner:
             raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
         stalls = self._stalls.take()
         self._stalls.note_held(list(self._modes.values()).count(Mode.HOLD))
-        if self._note != STARTING:  # services that start take the machine's time
+        if self._note == STARTING:  # services that start take the machine's time, and hold
+            self._stalls.longest = Stall(0, 0)
+        else:
             self._events.tell(stalls)
 
     def _stall_words(self) -> str:
