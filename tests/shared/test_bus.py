@@ -371,6 +371,16 @@ def test_a_batch_brings_nothing_that_its_sender_may_not_put(recorded: Recorded) 
     assert recorded.taken == [("state", 7)]
 
 
+def test_behind_a_slow_disk_a_bounded_number_of_batches_waits(recorded: Recorded) -> None:
+    for seq in range(1500):
+        recorded.traces.put(sample(JointTrace, seq=seq))
+        if seq % 20 == 0:
+            time.sleep(0.005)  # a full queue of the sender drops, too
+    time.sleep(0.3)
+    assert recorded.take() == 1000
+    assert recorded.taken[-1] == ("trace", 1499)
+
+
 USES_REFUSED: dict[str, Callable[[Session], object]] = {
     "harness/wrench: Estop is not its type; use W": lambda s: s.publisher(topics.WRENCH, Estop),
     r"joint/\*/command: '' is no module": lambda s: s.latest(topics.JOINT_COMMAND, JointCommand),
