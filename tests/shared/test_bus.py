@@ -377,7 +377,7 @@ def test_behind_a_slow_disk_a_bounded_number_of_batches_waits(recorded: Recorded
         if seq % 20 == 0:
             time.sleep(0.005)  # a full queue of the sender drops, too
     time.sleep(0.3)
-    assert recorded.take() == 1000
+    assert 500 < recorded.take() <= 1000
     assert recorded.taken[-1] == ("trace", 1499)
 
 
