@@ -19,7 +19,7 @@ from tools.judge.reports.events import Events, TimelineEvent
 from tools.judge.reports.panels import COLOURS, GAP_S, Line, Panel, panels_of
 from tools.judge.reports.run_data import RunData
 from tools.judge.verdict import ShownStall, Summary, fell
-from tools.logs.run_index import RunIndex
+from tools.logs.run_index import RunIndex, files_of_run, head_of
 from tools.logs.run_log import PICTURE_MAX_S, RunLog, RunPart
 from tools.output import new_figure, save_figure
 
@@ -57,7 +57,8 @@ def judge_run(out: Path, title: str, duration_s: float, **figures: float | None)
     The picture of a long run is that of its end. `figures` are fields of the summary that no log
     tells.
     """
-    index = RunIndex(out / "run.mcap")
+    path = out / "run.mcap"
+    index = RunIndex(path, files_of_run(path, head_of(path)))  # a long record is split
     last_s = max(0.0, index.length_s - PICTURE_MAX_S)
     log = RunLog(index, RunPart(last_s))
     if last_s > 0.0:

@@ -20,6 +20,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
 from tests.lockstep.runs import still
 from tests.messages import sample
+from tests.shared.mcap_log.runs import recorded_in_parts
 from tools import cli
 from tools.judge import figure, verdict, verdict_table
 from tools.judge.standing import (
@@ -251,6 +252,14 @@ def test_only_a_hand_that_presses_a_robot_which_tracks_counts_as_overforce(
     ]
     log: Any = Events((0.0, Mode.TRACK), (held_from_s, Mode.HOLD))
     assert _overforce_s(log, truth) == pytest.approx(longest_s, abs=0.02)
+
+
+def test_a_run_in_several_files_is_judged_to_its_end(impaired: RunLog, tmp_path: Path) -> None:
+    """An hour's demo was judged by its first file, and was NOT FINISHED."""
+    folder = recorded_in_parts(impaired, tmp_path / "split")
+    assert (folder / "run_1.mcap").exists()
+    whole = verdict.summarise(impaired, 1.0)
+    assert figure.judge_run(folder, "split", 1.0).duration_s == whole.duration_s
 
 
 @pytest.fixture(scope="module")
