@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from shared.exceptions import RunError
+from shared.mcap_log.writer import SCHEMA_VERSION
 from tests.tools.exit_codes import exit_code
 from tests.tools.logs.reexecution.test_golden import GOLDEN
 from tools import cli
@@ -177,7 +178,7 @@ def test_a_small_file_that_expands_to_gigabytes_is_refused(
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=30 << 20, compression=CompressionType.ZSTD)
         writer.start(profile="xrl")
-        writer.add_metadata("run", {"robot": "xrl", "schema_version": "6"})
+        writer.add_metadata("run", {"robot": "xrl", "schema_version": SCHEMA_VERSION})
         writer.add_metadata("clock", {"offset_ns": "0"})
         schema = writer.register_schema("x", "jsonschema", b"{}")
         channel = writer.register_channel("xrl/xrl/planner/status", "json", schema)
