@@ -4,7 +4,7 @@ Pure: state, now, inputs -> state. The transitions are one table; `tests/safety`
 against every event.
 
     DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any armed -> FAULT (drive or
-    its position lost)
+    its position lost), or DAMP, limp (the robot has fallen)
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ class Event(IntEnum):
     DRIVE_LOST = 1
     DRIVE_DISARMED = 2
     POSITION_LOST = 3
-    SHAKING = 4
-    TORQUE_LIMIT = 5
-    TOO_FAST = 6
-    DRIVE_ARMED = 7
-    PLANNER_ENDED = 8
-    COMMAND_STALE = 9
-    HOLD_REQUESTED = 10
-    READY = 11
-    NONE = 12
+    FALLEN = 4
+    SHAKING = 5
+    TORQUE_LIMIT = 6
+    TOO_FAST = 7
+    DRIVE_ARMED = 8
+    PLANNER_ENDED = 9
+    COMMAND_STALE = 10
+    HOLD_REQUESTED = 11
+    READY = 12
+    NONE = 13
 
 
 Q_REF_MAX: Final = 6.4
@@ -57,6 +58,7 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
         Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
         Event.POSITION_LOST: (Mode.FAULT, Cause.POSITION_LOST),
+        Event.FALLEN: (Mode.DAMP, Cause.FALLEN),
         Event.READY: (Mode.TRACK, Cause.COMMANDS_FRESH),
     },
     Mode.TRACK: {
@@ -64,6 +66,7 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
         Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
         Event.POSITION_LOST: (Mode.FAULT, Cause.POSITION_LOST),
+        Event.FALLEN: (Mode.DAMP, Cause.FALLEN),
         Event.SHAKING: (Mode.HOLD, Cause.SHAKING),
         Event.TORQUE_LIMIT: (Mode.HOLD, Cause.TORQUE_LIMIT),
         Event.TOO_FAST: (Mode.HOLD, Cause.TOO_FAST),
@@ -75,6 +78,7 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
         Event.DRIVE_LOST: (Mode.FAULT, Cause.DRIVE_LOST),
         Event.DRIVE_DISARMED: (Mode.FAULT, Cause.DRIVE_DISARMED),
         Event.POSITION_LOST: (Mode.FAULT, Cause.POSITION_LOST),
+        Event.FALLEN: (Mode.DAMP, Cause.FALLEN),
     },
     Mode.FAULT: {},
 }
@@ -114,6 +118,8 @@ def timing_of(config: RobotConfig) -> Timing:
     )
 
 
+FALLEN_NS: Final = 50 * NS_PER_MS
+"""How long a planner must say that the robot has fallen; one wrong command is no fall."""
 RETIRED_SESSIONS_KEPT: Final = 256
 """Planners that a module remembers; after more restarts the first of them could come back."""
 TAU_ACCEPTED_MAX: Final = 4.0
@@ -129,7 +135,7 @@ REFUSED_SHOWN_NS: Final = NS_PER_S
 # Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _HOLD, _TRACK = Mode.DISARMED, Mode.HOLD, Mode.TRACK
 _ESTOP, _DRIVE_ARMED, _STALE = Event.ESTOP, Event.DRIVE_ARMED, Event.COMMAND_STALE
-_PLANNER_ENDED: Final = Event.PLANNER_ENDED
+_PLANNER_ENDED, _FALLEN = Event.PLANNER_ENDED, Event.FALLEN
 _HOLD_REQUESTED, _READY, _NONE = Event.HOLD_REQUESTED, Event.READY, Event.NONE
 _INSIDE, _USABLE = Outside.NOTHING, Refusal.NONE
 
@@ -161,6 +167,10 @@ class Failsafe(msgspec.Struct):
     """Time of that judgement; an old one is no longer reported."""
     planner_ended: bool = False
     """True from the end of the followed planner's process until the cycle that acts on it."""
+    fallen_since_ns: int = -1
+    """Time since which the planner has said that the robot has fallen; -1: it does not."""
+    limp: bool = False
+    """In DAMP: the robot has fallen, and this module only damps."""
 
     def offer(
         self,
@@ -272,11 +282,15 @@ class Failsafe(msgspec.Struct):
             self.fresh_since_ns = -1  # commands from before arming do not count
         elif self.fresh_since_ns < 0:
             self.fresh_since_ns = now_ns
+        if not fresh or self.command is None or not self.command.fallen or mode is _DISARMED:
+            self.fallen_since_ns = -1
+        elif self.fallen_since_ns < 0:
+            self.fallen_since_ns = now_ns
         event = self._event(now_ns, timing, drive, estop, fresh and not broken)
         self.planner_ended = False
         if trip is not _NONE and tracks:
             gone = estop or not (drive is _NONE or drive is _DRIVE_ARMED)
-            if not gone:
+            if not gone and event is not _FALLEN:
                 event = trip
                 self.fresh_since_ns = now_ns  # after a trip it waits as after a drop-out
         row = TRANSITIONS[mode].get(event)
@@ -290,6 +304,7 @@ class Failsafe(msgspec.Struct):
         if row is None:
             return None
         self.mode = row[0]
+        self.limp |= event is _FALLEN
         return row[1]
 
     def _event(self, now_ns: int, timing: Timing, drive: Event, estop: bool, fresh: bool) -> Event:
@@ -300,6 +315,9 @@ class Failsafe(msgspec.Struct):
                 return drive
         elif drive is not _NONE:
             return drive
+        said_ns = now_ns - self.fallen_since_ns if self.fallen_since_ns >= 0 else 0
+        if said_ns >= FALLEN_NS and not self.limp:
+            return _FALLEN
         if not fresh:
             return _PLANNER_ENDED if self.planner_ended else _STALE
         if self.command is not None and self.command.hold:

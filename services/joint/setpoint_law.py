@@ -1,5 +1,7 @@
 """The setpoint of each instant: TRACK follows the planner, HOLD freezes, DAMP sinks. Pure.
 
+After a fall a module in DAMP only damps: docs/hazards.md has the figures that chose this.
+
 A change of mode freezes the setpoint in force; the new mode starts from it, so that no change makes
 a torque step.
 """
@@ -54,6 +56,7 @@ class SetpointLaw:
         self._coupled_ramp_ns = service.coupled_ramp_ms * NS_PER_MS
         self._blend_ns = service.blend_ms * NS_PER_MS
         self._stiffen_ns = service.stiffen_ms * NS_PER_MS
+        self._limp_k_d = (service.fallen_k_d, service.fallen_k_d)
         self._sinking = Sinking(config, module)
 
     def at_rest(self) -> SetpointState:
@@ -109,6 +112,11 @@ class SetpointLaw:
             near: what is known of the other modules on this host.
         """
         mode = failsafe.mode
+        if failsafe.limp and mode is _DAMP:
+            share = min(1.0, (now_ns - s.changed_ns) / self._coupled_ramp_ns)
+            limp_law = pd_law.stand(s.frozen.q_ref, pd_law.ZERO, self._limp_k_d)
+            s.current = pd_law.blend(s.frozen, limp_law, share)
+            return s.current
         limp = near.stiffen and (mode is _HOLD or mode is _DAMP)
         if not s.stiffened_ns and (limp or failsafe.stiffen_requested):
             s.stiffened_ns = now_ns

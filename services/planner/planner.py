@@ -18,9 +18,11 @@ from services.planner.law.assist import Overload, OverloadState, force_up
 from services.planner.law.closed_reference import Toward
 from services.planner.law.feet import Soles
 from services.planner.law.hocca import Hocca, LawInputs, LawOutput, LawState
+from services.planner.law.load import LoadState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
 from services.planner.watch.engagement_fsm import Engagement, LimpLegWatch, RivalWatch
+from services.planner.watch.fallen import FallState, FallWatch, Seen
 from services.planner.watch.plausible import HarnessTrust, Plausible
 from services.planner.watch.reserves import HeatWatch, HeatWatchState, SupplyState, SupplyWatch
 from services.planner.watch.trips import PlannerTrips, TripsState, values_of
@@ -90,6 +92,7 @@ class PlannerState(msgspec.Struct, kw_only=True):
     """Changes only if a controller of your own runs."""
     unattended: Unattended = msgspec.field(default_factory=Unattended)
     trips: TripsState = msgspec.field(default_factory=TripsState)
+    fall: FallState = msgspec.field(default_factory=FallState)
 
 
 class Inputs(NamedTuple):
@@ -112,6 +115,8 @@ class Inputs(NamedTuple):
     """Newest of the harness; None if it is invalid or too old."""
     up: Vector3 | None
     """Unit vector against gravity, torso axes; None if it is invalid or too old."""
+    turning: Vector3 | None
+    """Angular velocity of the torso by the IMU, rad/s, torso axes; None with `up`."""
     request: OperatorRequest
 
 
@@ -156,6 +161,7 @@ class Planner:
         self._plausible = Plausible(config)
         self._overload = Overload(config.harness)
         self._trips = PlannerTrips(config)
+        self._fall = FallWatch(config)
         self._soles = Soles(config)
         self._heat = HeatWatch(config.heat)
         self._supply = SupplyWatch(config.supply)
@@ -255,9 +261,9 @@ class Planner:
         wrench, attitude = s.wrench, s.attitude
         if wrench is not None and not (wrench.valid and now_ns - s.wrench_ns <= ages.wrench):
             wrench = None
-        up = None
+        up = turning = None
         if attitude is not None and attitude.valid and now_ns - s.attitude_ns <= ages.attitude:
-            up = attitude.up
+            up, turning = attitude.up, attitude.rate
         return Inputs(
             now_ns,
             dt,
@@ -268,6 +274,7 @@ class Planner:
             tau=np.array([state.tau for state in states]).ravel(),
             wrench=wrench,
             up=up,
+            turning=turning,
             request=s.request,
         )
 
@@ -361,6 +368,13 @@ class Planner:
             moves=s.heat.moves,
         )
         self._trips.advance(s.trips, inputs.now_ns, values, leads=leads)
+        if s.law.has_led:
+            tipping = self._soles.tipping(inputs.tau, soles)
+            closure, up, turning = output.closure.tolist(), inputs.up, inputs.turning
+            seen = Seen(pose, rates, closure, soles, tipping, up, turning)
+            modes = [state.mode for state in inputs.states]
+            if self._fall.advance(s.fall, inputs.now_ns, modes, seen):
+                s.law.load, s.law.has_led, s.trust = LoadState(), False, HarnessTrust()
 
     def _announcement(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
         """Return now and then commands that answer no state: too old, whatever the network does."""
@@ -408,6 +422,7 @@ class Planner:
                 margin_onboard=local.margins.onboard,
                 stiffen=s.support.includes(module),
                 state_phase=phase,
+                fallen=s.fall.fell_ns > 0,
             )
             for module, state, phase, q_ref, v_ref, tau_ff, dtau_ff, tau_coupled, k_p, k_d in zip(
                 MODULES, inputs.states, s.phases.phases, *pairs, strict=True
@@ -428,6 +443,8 @@ class Planner:
         s = self.state
         if s.rival.yields:
             return PlannerMode.YIELDING
+        if s.fall.fell_ns:
+            return PlannerMode.FALLEN
         if s.overload.hold:
             return PlannerMode.OVERLOADED
         if s.law.stance.refusal:
@@ -452,6 +469,7 @@ class Planner:
         s = self.state
         refusal = (
             s.rival.describe()
+            or s.fall.describe()
             or s.law.stance.refusal
             or self._law.load.refusal(s.law.load)
             or s.trips.why

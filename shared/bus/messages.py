@@ -40,7 +40,7 @@ class Mode(IntEnum):
     TRACK = 2
     """Follows the planner's commands."""
     DAMP = 3
-    """After an emergency stop: sinks slowly."""
+    """After an emergency stop: sinks slowly. After a fall: only damps."""
     FAULT = 4
     """The drive, or its position, is lost; left by a restart only."""
 
@@ -74,6 +74,8 @@ class Cause(IntEnum):
     """A trip of this module."""
     PLANNER_ENDED = 12
     """The process of its planner, on the same host, has ended."""
+    FALLEN = 13
+    """The planner says that the robot has fallen."""
 
 
 class Trip(IntEnum):
@@ -200,6 +202,8 @@ class PlannerMode(IntEnum):
     YIELDING = 8
     """Another planner leads: this one sends no command that a module could use until that one has
     ended."""
+    FALLEN = 9
+    """The robot has fallen: all are to go limp, until a person has re-armed them."""
 
 
 class HeatAction(IntEnum):
@@ -367,6 +371,8 @@ class JointCommand(Message, frozen=True):
     state_phase: Int64 = 0
     """The module is to send its state in the periods of this number, modulo the periods of a state
     (docs/architecture.md#rates)."""
+    fallen: bool = False
+    """True once the robot has fallen: this module is to give up all stiffness."""
 
 
 class JointEvent(Message, frozen=True):

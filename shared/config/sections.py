@@ -237,6 +237,8 @@ class JointServiceConfig(Section, frozen=True):
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
     pendant_ms: Annotated[float, Range(20.0, 10_000.0, "ms")] = 500.0
     """Silence of a pendant that is an emergency stop, once the pendant was there."""
+    fallen_k_d: LocalDamping = 20.0
+    """Damping of all twelve axes once the robot has fallen; nothing else is left then."""
     limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
     """Gains of each hip's theta while a knee is limp: its leg stands as a strut on them."""
     stiffen_ms: Milliseconds = 300.0

@@ -14,7 +14,7 @@ from shared.config.impairment import Direction, Impairer, Impairment
 from shared.links import directions_of
 
 
-class PendingImpairment(NamedTuple):
+class _Pending(NamedTuple):
     """One impairment that is not over, started or not."""
 
     begins: float
@@ -36,7 +36,7 @@ class ImpairmentSchedule:
     def __init__(
         self, directions: Mapping[str, Direction], report: Callable[[LinkEvent], object]
     ) -> None:
-        self.requested: dict[int, PendingImpairment] = {}
+        self.requested: dict[int, _Pending] = {}
         self.next_due = math.inf
         """When the first of them begins or ends, on the owner's clock."""
         self._directions = directions
@@ -56,7 +56,7 @@ class ImpairmentSchedule:
         """Plan an impairment that `advance` starts when it is due; return its number."""
         directions_of(link)
         self._count += 1
-        self.requested[self._count] = PendingImpairment(begins, until, link, what)
+        self.requested[self._count] = _Pending(begins, until, link, what)
         self._coming.append(self._count)
         self._find_next()
         return self._count
@@ -128,7 +128,7 @@ class ImpairmentSchedule:
         self,
         name: str,
         number: int,
-        requested: PendingImpairment,
+        requested: _Pending,
         now_ns: int,
         ended: Impairer | None,
     ) -> None:

@@ -108,6 +108,9 @@ DRIVE_FAULTS: Final[dict[FaultKind, DriveFault]] = {
 """By the name that scenarios and `--fault` use."""
 
 
+FALLEN_REMEDY: Final = "free the person and hang the robot, then xrl rearm"
+
+
 class _LossRow(NamedTuple):
     """A lost process or link, or the emergency stop."""
 
@@ -186,6 +189,12 @@ LOSSES: Final[dict[str, _LossRow]] = {
         "HOLD, on the planner's request; the planner's own trips hold all six",
         "`xrl status`: because SHAKING, TORQUE_LIMIT, TOO_FAST; planner/status: TRIPPED, and why",
         "automatic, after a wait that each trip lengthens",
+    ),
+    "a fall": _LossRow(
+        "DAMP: every axis only damps, none is stiff",
+        "the same",
+        "planner/status: FALLEN, and the signs; `xrl status`: DAMP because FALLEN, exit code 1",
+        f"{FALLEN_REMEDY}; it is led once its feet bear its weight",
     ),
     "overload at the harness": _LossRow(
         "HOLD",

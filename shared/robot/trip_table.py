@@ -14,7 +14,7 @@ import msgspec
 from shared.bus.messages import Cause, DriveStatus, JointState, Mode, Outside, PlannerStatus, Trip
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import TripLimit, TripsConfig
-from shared.robot.fault_table import recovery_of
+from shared.robot.fault_table import FALLEN_REMEDY, recovery_of
 
 
 class TripRow(NamedTuple):
@@ -139,7 +139,7 @@ def remedy_of(state: JointState) -> str:
     if mode is Mode.FAULT:
         return f"{recovery_of(cause)}; then {RESTART}"
     if mode is Mode.DAMP:
-        return REARM
+        return FALLEN_REMEDY if cause is Cause.FALLEN else REARM
     if drive is DriveStatus.UNZEROED:
         return "hang the robot, xrl drive zero"
     if drive is DriveStatus.UNACKNOWLEDGED:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
 from services.joint.controller import CycleResult
-from shared.bus.messages import DriveStatus, Mode
+from shared.bus.messages import Cause, DriveStatus, Mode
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import kind_of
 from tests.joint.helpers import Bench
@@ -100,6 +102,25 @@ def test_a_stop_never_drops_what_springs_carried_and_damps(bench: Bench) -> None
     bench.v = (0.0, -0.3)
     resists = bench.run(round(ROBOT.joint_service.blend_ms / 2) + 10)[-1].tau[1] - still
     assert resists == pytest.approx(ROBOT.joint_service.damp_k_d * 0.3)
+
+
+@pytest.mark.parametrize("stopped_first", [False, True])
+def test_after_a_fall_every_axis_only_damps_and_none_is_jerked(
+    bench: Bench, stopped_first: bool
+) -> None:
+    bench.to_track(tau_ff=(3.0, -25.0), tau_coupled=(12.0, -9.0))
+    if stopped_first:
+        bench.cycle(estop=True)
+    before = bench.run(5)[-1].tau
+    taus = [bench.cycle(bench.fresh(hold=True, fallen=True)).tau for _ in range(60)]
+    assert (bench.mode, bench.controller.cause) == (Mode.DAMP, Cause.FALLEN)
+    for last, tau in itertools.pairwise([before, *taus]):
+        assert tau == pytest.approx(last, abs=6.0)
+    assert taus[-1] == (0.0, 0.0)
+    bench.v = (0.1, -0.3)
+    k_d = ROBOT.joint_service.fallen_k_d
+    damped = bench.run(40)[-1].tau
+    assert damped == pytest.approx((-0.1 * k_d, 0.3 * k_d), rel=0.02)
 
 
 @pytest.mark.parametrize("module", ["ankle_left", "knee_left", "hip_right"])

@@ -60,7 +60,7 @@ MOVING: Final = 0.3
 """Fraction of a tone's fastest rate; slower samples, where a joint sticks, are not used."""
 
 
-class Tone(NamedTuple):
+class _Tone(NamedTuple):
     """One sine, which swells in its first cycle and fades in its last."""
 
     frequency_hz: float
@@ -92,7 +92,7 @@ class Tone(NamedTuple):
 class _Tones(NamedTuple):
     """Tones one after the other (`tools.bringup.motion.AxisCourse`)."""
 
-    tones: tuple[Tone, ...]
+    tones: tuple[_Tone, ...]
 
     @property
     def duration_s(self) -> float:
@@ -117,7 +117,7 @@ class _Tones(NamedTuple):
                 return tone.offset(t_s - begin_s)
         return 0.0, 0.0
 
-    def begins(self) -> list[tuple[float, Tone]]:
+    def begins(self) -> list[tuple[float, _Tone]]:
         """Return when each tone begins, s."""
         found, at = [], 0.0
         for tone in self.tones:
@@ -152,7 +152,7 @@ def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> 
     for hertz, cycles in HEAVY_TONES if inertia > HEAVY else TONES:
         needed = abs(inertia * (2.0 * math.pi * hertz) ** 2 - gravity)
         most = TORQUE_SHARE * torque / max(needed, gravity, 1e-9)
-        tones.append(Tone(hertz, float(min(AMPLITUDE_MAX, most)), cycles))
+        tones.append(_Tone(hertz, float(min(AMPLITUDE_MAX, most)), cycles))
     k_p = min(max(PER_INERTIA[0] * inertia, K_P[0]), K_P[1])
     k_d = min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1])
     # alike for both axes: both motors' own loops then do all of it
@@ -194,7 +194,7 @@ def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
 
 
 def _steady(
-    samples: Sequence[Sample], begin_s: float, tone: Tone, axis: int
+    samples: Sequence[Sample], begin_s: float, tone: _Tone, axis: int
 ) -> tuple[Array, Array, Array, Array]:
     """Return regressors (n, 5), torque (n,), cycle and weight of a tone's steady part.
 

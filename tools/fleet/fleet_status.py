@@ -40,7 +40,7 @@ from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
 from shared.clock import NS_PER_S, now_ns, pace
 from shared.config.endpoints import host_and_port
 from shared.config.robot_config import SERVICES, RobotConfig
-from shared.exceptions import BusError, FleetError
+from shared.exceptions import FELL_EXIT_CODE, BusError, FleetError
 from shared.joints import MODULES
 from shared.robot.trip_table import reason_of, remedy_of
 from tools.fleet import procfs
@@ -158,6 +158,12 @@ class FleetStatus(msgspec.Struct, frozen=True):
     """What is wrong with supervision, logs and disk, a line each."""
     bus_faults: tuple[str, ...] = ()
     """Under `mtls`: links that TLS refuses, in words."""
+
+    @property
+    def exit_code(self) -> int:
+        """`FELL_EXIT_CODE` if the planner says that the robot has fallen, else 0."""
+        fell = self.lead is not None and self.lead.mode == PlannerMode.FALLEN.name
+        return FELL_EXIT_CODE if fell else 0
 
 
 class RateMonitor:

@@ -1,4 +1,4 @@
-"""`xrl status`: every service and every module."""
+"""`xrl status`: every service and every module; exit code 1 if the robot has fallen."""
 
 from __future__ import annotations
 
@@ -40,10 +40,11 @@ def run(flags: StatusFlags) -> int:
         if flags.json:
             status = read_status(fleet, monitors, bus)
             print(msgspec.json.format(msgspec.json.encode(status)).decode())
-            return 0
+            return status.exit_code
         if not flags.watch:
-            Console().print(tables(read_status(fleet, monitors, bus)))
-            return 0
+            status = read_status(fleet, monitors, bus)
+            Console().print(tables(status))
+            return status.exit_code
         with renewed(Console()) as show:
             while True:
                 show(tables(read_status(fleet, monitors, bus)))

@@ -212,6 +212,7 @@ class Soles:
 
     def __init__(self, config: RobotConfig) -> None:
         self._half_width = 0.5 * config.geometry.w_foot
+        self._half_length = 0.5 * config.geometry.l_foot
         self._leg_weight = config.leg_weight
         self._at_rest = 0.5 * (config.total_mass * GRAVITY + config.leg_weight)
 
@@ -240,3 +241,20 @@ class Soles:
             borne = self._at_rest if math.isnan(load) else max(load, LOAD_MIN)
             out = max(out, abs(float(tau[ankle])) / borne)
         return out / self._half_width
+
+    def tipping(self, tau: Array, loads: Pair) -> float:
+        """Return how far out a sole's pressure is in any direction: 1 at an edge, toe or heel.
+
+        The larger one of both. A sole of unknown load, or under `LOAD_MIN`, counts as 0.
+
+        Args:
+            tau: joint torques (12,), N m.
+            loads: of the soles, N.
+        """
+        out = 0.0
+        for ankle, load in zip(ANKLES, loads, strict=True):
+            if load > LOAD_MIN:
+                sideways = abs(float(tau[ankle])) / self._half_width
+                along = abs(float(tau[ankle + 1])) / self._half_length
+                out = max(out, sideways / load, along / load)
+        return out

@@ -97,7 +97,7 @@ class Property(NamedTuple):
     write: Callable[[EmulatedBoard, Value], None] | None = None
 
 
-class Argument(NamedTuple):
+class _Argument(NamedTuple):
     """An argument of a function: an endpoint of its own, written before the call."""
 
     name: str
@@ -110,10 +110,10 @@ class Function(NamedTuple):
     name: str
     call: Callable[..., None]
     """Function of the board and the arguments."""
-    arguments: tuple[Argument, ...] = ()
+    arguments: tuple[_Argument, ...] = ()
 
 
-Endpoint = Property | Function | Argument
+Endpoint = Property | Function | _Argument
 
 
 def endpoints() -> list[Endpoint]:
@@ -183,7 +183,7 @@ def _axis(i: int) -> list[Property | Function]:
         Function(
             "encoder.set_linear_count",
             lambda b, count: b.bank.set_count(b.axis(i), count),
-            (Argument("count", "int32"),),
+            (_Argument("count", "int32"),),
         ),
         fault("controller.error", "uint8", "controller"),
         *(_input(name, i) for name in ("input_pos", "input_vel", "input_torque")),
@@ -270,7 +270,7 @@ class FibreFront:
         self.ignored = 0
         self._rows = endpoints()
         self._arguments: dict[int, float] = {
-            number: 0 for number, row in enumerate(self._rows) if isinstance(row, Argument)
+            number: 0 for number, row in enumerate(self._rows) if isinstance(row, _Argument)
         }
         self.descriptor = json.dumps(_tree(self._rows), separators=(",", ":")).encode()
         self._crc = crc16(PROTOCOL_VERSION, self.descriptor)
@@ -305,7 +305,7 @@ class FibreFront:
             row.call(self.board, *values)
             return b""
         codec = CODECS[row.type]
-        if isinstance(row, Argument):
+        if isinstance(row, _Argument):
             held = codec.pack(self._arguments[number - 1])
             if len(payload) >= codec.size:
                 self._arguments[number - 1] = codec.unpack_from(payload)[0]
@@ -341,7 +341,7 @@ def _tree(rows: list[Endpoint]) -> list[dict[str, Any]]:
         return objects[path]
 
     for number, row in enumerate(rows, start=1):
-        if not isinstance(row, Argument):
+        if not isinstance(row, _Argument):
             path, _, name = row.name.rpartition(".")
             members(path).append({"name": name, "id": number, **_description(number, row)})
     return root

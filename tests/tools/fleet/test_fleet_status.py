@@ -114,12 +114,15 @@ def test_a_module_without_states_is_not_guessed_at() -> None:
         (LeadStatus("LEADING", 0.0, 1.2), "planner LEADING, margin 1.20"),
         (LeadStatus("ALIGNING", 12.3, 1.2), "leads again in 12 s"),
         (LeadStatus("MISPLACED", 0.0, 1.2, "a foot is ahead"), "margin 1.20; a foot is ahead"),
+        (LeadStatus("FALLEN", 0.0, 1.2, "it has fallen (apart)"), "FALLEN, margin 1.20; it has"),
     ],
 )
 def test_whether_the_planner_leads_and_why_not_is_reported(
     lead: LeadStatus | None, words: str
 ) -> None:
     assert words in _describe_lead(lead)
+    fell = lead is not None and lead.mode == "FALLEN"
+    assert FleetStatus("/tmp/x", "robot.toml", {}, {}, lead).exit_code == int(fell)
 
 
 def fleet_with(lead_session: int, *modules: ModuleStatus) -> FleetStatus:

@@ -1,0 +1,181 @@
+"""Detects from inside that the robot has fallen. Pure.
+
+All six modules then go limp (`services.joint.setpoint_law`), and a robot that stands would sink to
+the floor. So no sign counts alone: it has fallen once two that agree have done so for `AFTER_NS`.
+
+    tilted    by the IMU, the plane of the soles is off gravity by more than `TILT_MAX`
+    apart     the two legs disagree about the torso by more than `APART_MAX`: a sole is up
+    whirled   by the IMU's gyroscope, that plane turned faster than `WHIRL_MIN` a moment ago
+    turned    the torso is turned on its legs farther than anybody leads it
+    tipped    a sole's pressure was at its edge a moment ago, while both bore the robot
+    unloaded  the soles bear less than `UNLOADED` of the weight
+
+With an IMU, `tilted` or `apart` is one of the two. Without one, a robot that topples stiffly on
+straight legs shows nothing: figures in docs/hazards.md. On straight legs the joints' torques do not
+tell what the soles bear. `unloaded` then counts only beside `turned` or `apart`.
+
+It ends when a person has re-armed the modules: one that had let go holds again. The planner then
+begins as a new one does, and leads only a robot whose feet bear its weight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+
+from services.planner.law.feet import slope_of
+from shared.bus.messages import Mode, Pair, Vector3
+from shared.clock import NS_PER_MS
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.robot.fault_table import FALLEN_REMEDY
+
+AFTER_NS: Final = 150 * NS_PER_MS
+"""A robot that is caught in time swings back sooner."""
+MOMENT_NS: Final = 500 * NS_PER_MS
+"""From tipping on an edge to the floor it takes 0.5 to 0.8 s."""
+TILT_MAX: Final = 0.4
+"""rad; it stands on 0.12, and hung on a hoist it swings by 0.3."""
+WHIRL_MIN: Final = 0.5
+"""rad/s"""
+APART_MAX: Final = (0.15, 0.3)
+"""m and rad; 0.03 m trips (`trips.legs`), and a stone under a sole makes 0.05 m."""
+ROLL_YAW_MAX: Final = (0.3, 0.5)
+"""rad; requests are 0.12 at most."""
+PITCH: Final = (-0.45, 1.6)
+"""rad; led are -0.1 to 1.2."""
+TIPPING: Final = 0.75
+"""Of half the sole; 1 is its edge. The torques of a sole that tips are behind it."""
+BORNE: Final = 0.8
+"""Of the weight: with less on its soles, a hoist pulls the robot over an edge as it lifts it."""
+UNLOADED: Final = 0.45
+"""Of the weight."""
+
+_DOWN: Final = (Mode.DAMP, Mode.FAULT)
+_STIFF: Final = (Mode.HOLD, Mode.TRACK)
+_SURE: Final = ("tilted", "apart")
+
+
+class Seen(NamedTuple):
+    """What a tick sees of the robot."""
+
+    pose: Sequence[float]
+    """p (6,), m and rad."""
+    rates: Sequence[float]
+    """Its rate (6,)."""
+    closure: Sequence[float]
+    """Left minus right leg's estimate of the torso (6,), m and rad."""
+    soles: Pair
+    """What they bear, N; NaN if it is not known."""
+    tipping: float
+    """`services.planner.law.feet.Soles.tipping`."""
+    up: Vector3 | None
+    """Unit vector against gravity, torso axes; None: not known."""
+    turning: Vector3 | None
+    """Angular velocity of the torso, rad/s, torso axes; None: not known."""
+
+
+class FallState(msgspec.Struct):
+    """State of `FallWatch`."""
+
+    since_ns: int = 0
+    """Time since which two signs agree; 0: they do not."""
+    tipped_ns: int = 0
+    """Time at which a sole last tipped."""
+    whirled_ns: int = 0
+    """Time at which the soles last turned fast."""
+    fell_ns: int = 0
+    """Time at which it was found to have fallen; 0: it has not."""
+    signs: str = ""
+    """What showed that, in words."""
+    down: int = 0
+    """Bit i: module i has let go since."""
+
+    def describe(self) -> str:
+        """Return that it has fallen and what to do, in words; "" if it has not."""
+        if not self.fell_ns:
+            return ""
+        return f"it has fallen ({self.signs}): {FALLEN_REMEDY}"
+
+
+class FallWatch:
+    """Compares the signs with each other."""
+
+    def __init__(self, config: RobotConfig) -> None:
+        """Take the robot's weight."""
+        self._weight = config.total_mass * GRAVITY
+
+    def advance(self, s: FallState, now_ns: int, modes: Sequence[int], seen: Seen) -> bool:
+        """Advance by one tick; return True if a person has just re-armed a robot that had fallen.
+
+        Args:
+            s: this watch's state, which changes.
+            now_ns: the planner's clock.
+            modes: of the six modules; while none is stiff nobody falls harder.
+            seen: what this tick sees.
+        """
+        if s.fell_ns:
+            return _is_rearmed(s, modes)
+        borne = sum(seen.soles)
+        if seen.tipping > TIPPING and borne > BORNE * self._weight:
+            s.tipped_ns = now_ns
+        if seen.turning is not None and _whirl(seen, seen.turning) > WHIRL_MIN:
+            s.whirled_ns = now_ns
+        signs = self._signs(s, now_ns, seen, borne)
+        agree = len(signs) >= 2 and (seen.up is None or signs[0] in _SURE)
+        if not agree or not any(mode in _STIFF for mode in modes):
+            s.since_ns = 0
+            return False
+        s.since_ns = s.since_ns or now_ns
+        if now_ns - s.since_ns >= AFTER_NS:
+            s.fell_ns, s.signs, s.since_ns, s.down = now_ns, " and ".join(signs), 0, 0
+        return False
+
+    def _signs(self, s: FallState, now_ns: int, seen: Seen, borne: float) -> list[str]:
+        """Return the signs that are there now, `tilted` and `apart` first."""
+        signs = []
+        _, _, _, roll, pitch, yaw = seen.pose
+        if seen.up is not None and max(map(abs, slope_of(seen.up, roll, pitch, yaw))) > TILT_MAX:
+            signs.append("tilted")
+        is_apart = (
+            math.hypot(*seen.closure[:3]) > APART_MAX[0]
+            or max(map(abs, seen.closure[3:])) > APART_MAX[1]
+        )
+        if is_apart:
+            signs.append("apart")
+        if s.whirled_ns and now_ns - s.whirled_ns < MOMENT_NS:
+            signs.append("whirled")
+        is_turned = (
+            abs(roll) > ROLL_YAW_MAX[0]
+            or abs(yaw) > ROLL_YAW_MAX[1]
+            or not PITCH[0] < pitch < PITCH[1]
+        )
+        if is_turned:
+            signs.append("turned")
+        if s.tipped_ns and now_ns - s.tipped_ns < MOMENT_NS:
+            signs.append("tipped")
+        is_unknown = math.isnan(borne) and (is_apart or is_turned)
+        if is_unknown or borne < UNLOADED * self._weight:
+            signs.append("unloaded")
+        return signs
+
+
+def _is_rearmed(s: FallState, modes: Sequence[int]) -> bool:
+    """Return True, and forget the fall, once a module that had let go is stiff again."""
+    for i, mode in enumerate(modes):
+        if mode in _DOWN:
+            s.down |= 1 << i
+        elif s.down & 1 << i and mode in _STIFF:
+            s.fell_ns, s.signs = 0, ""
+            return True
+    return False
+
+
+def _whirl(seen: Seen, turning: Vector3) -> float:
+    """Return how fast the soles' plane turns, rad/s: the torso's rate less that on its legs."""
+    roll, pitch, yaw = seen.rates[3:]
+    cosine, sine = math.cos(seen.pose[4]), math.sin(seen.pose[4])
+    x, y, z = turning  # R = Rz(yaw) Rx(roll) Ry(pitch), with little roll
+    return math.hypot(x - (cosine * roll - sine * yaw), y - pitch, z - (sine * roll + cosine * yaw))
