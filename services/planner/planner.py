@@ -41,7 +41,7 @@ from shared.bus.messages import (
     Wrench,
 )
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.config.robot_config import RobotConfig
+from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_MODULES
 from shared.robot.hold_rules import Support
 
@@ -174,6 +174,7 @@ class Planner:
             attitude=round(config.imu.stale_ms * NS_PER_MS),
             command=round(service.max_command_age_ms * NS_PER_MS),
         )
+        self._payload = config.mass.payload
         self._output: LawOutput | None = None
 
     @property
@@ -529,6 +530,7 @@ class Planner:
             heat=int(s.heat.action),
             heat_left_s=s.heat.left_s,
             supply_v=s.supply.volts,
+            carried_n=GRAVITY * (self._payload + load.kg) - (s.heat.lifted or 0.0),
         )
 
 

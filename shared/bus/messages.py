@@ -514,6 +514,9 @@ class PlannerStatus(Message, frozen=True):
     """Least of the modules' seconds left at this load; 3600: an hour or more; -1: not estimated."""
     supply_v: float = 0.0
     """Lowest voltage of the drives' supplies, V, low-passed; 0: not known."""
+    carried_n: float = 0.0
+    """Weight of the payload, and of the load that was found beyond it, less the person's upward
+    force on the harness, N (docs/law.md#wearer); without the harness the payload's alone."""
 
 
 class OperatorIntent(Message, frozen=True):

@@ -32,7 +32,7 @@ LOADCELL_FRAMES: Final = 3
 """To a sample of the harness sensor."""
 
 
-class BusLoad(NamedTuple):
+class _BusLoad(NamedTuple):
     """Load of a bus, as shares of it."""
 
     steady: float
@@ -57,7 +57,7 @@ def bus_load(
     onboard: bool,
     heartbeat_period_ms: float,
     loadcell_rate_hz: float = 0.0,
-) -> BusLoad:
+) -> _BusLoad:
     """Return the load of a bus: per cycle, an estimate from each axis and a target to it.
 
     Onboard, targets of the motors' own loops take 8 bytes, and their gains; else torques take 4.
@@ -68,7 +68,7 @@ def bus_load(
     cyclic = rate_hz * (full + (full if onboard else half)) + 1e3 / heartbeat_period_ms * full
     other = LOADCELL_FRAMES * loadcell_rate_hz * full
     steady, blending = (axes * (cyclic + hz * gains) + other for hz in (GAINS_HZ, BLEND_HZ))
-    return BusLoad(steady / BITRATE, blending / BITRATE)
+    return _BusLoad(steady / BITRATE, blending / BITRATE)
 
 
 def check_buses(file: str, config: RobotConfig) -> None:

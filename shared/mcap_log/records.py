@@ -299,7 +299,7 @@ def split_messages(
     return rows, at
 
 
-class ChunkContent(NamedTuple):
+class _ChunkContent(NamedTuple):
     """The records of a chunk that can be read."""
 
     rows: list[ChunkMessage]
@@ -310,7 +310,7 @@ class ChunkContent(NamedTuple):
     of a record, and goes on, computes the CRC over what it has written."""
 
 
-def split_chunk(data: bytes, places: Sequence[int] = ()) -> ChunkContent:
+def split_chunk(data: bytes, places: Sequence[int] = ()) -> _ChunkContent:
     """Split a chunk's decompressed data into its records.
 
     `places` are the offsets of its messages, in order, if they are known: behind an incomplete
@@ -332,4 +332,4 @@ def split_chunk(data: bytes, places: Sequence[int] = ()) -> ChunkContent:
             at = next((place for place in places if place > at), len(data))
         found, at = split_messages(data, at, len(data))
         rows += found
-    return ChunkContent(rows, others, whole)
+    return _ChunkContent(rows, others, whole)

@@ -43,7 +43,7 @@ from shared.mcap_log import files, schema
 from shared.mcap_log.records import ZSTD_LEVEL
 from shared.mcap_log.sequence_stats import KeyCount
 
-SCHEMA_VERSION: Final = "7"
+SCHEMA_VERSION: Final = "8"
 """Version of the layout above and of the messages in `shared/bus/messages.py`."""
 
 # mcap's writer has no option for the level

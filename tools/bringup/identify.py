@@ -129,7 +129,7 @@ class _Tones(NamedTuple):
 SinePlan = MotionPlan[_Tones]
 
 
-class JointFit(NamedTuple):
+class _JointFit(NamedTuple):
     """What the sines show; each a value and its standard deviation."""
 
     inertia: tuple[float, float]
@@ -160,7 +160,7 @@ def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> 
     return SinePlan(axis, _Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
 
 
-def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
+def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> _JointFit | None:
     """Return what steady samples of a whole motion show; None if there are too few."""
     parts = []
     for along_s, tone in plan.course.begins():
@@ -185,7 +185,7 @@ def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> JointFit | None:
     inertia_sd = math.hypot(inertia_sd, k_d * TIME_SD, YIELDS * inertia)
     viscous_sd = math.hypot(viscous_sd, k_p * TIME_SD)
     dry_sd = math.hypot(dry_sd, DRY_SD)
-    return JointFit(
+    return _JointFit(
         inertia=(inertia, inertia_sd),
         viscous=(viscous, viscous_sd),
         dry=(dry, dry_sd),
@@ -254,7 +254,7 @@ class JointResult(NamedTuple):
     """What the sines of one joint showed."""
 
     joint: str
-    fit: JointFit
+    fit: _JointFit
     leg_inertia: float
     """Inertia of what hangs on it by the robot file, without its rotor, kg m^2."""
 

@@ -135,6 +135,8 @@ class LeadStatus(msgspec.Struct, frozen=True):
     why: str = ""
     """Why it does not lead, in words, where the mode does not say it all."""
     session: int = 0
+    carried_n: float = 0.0
+    """What the robot carries of payload and person now, N, as in `PlannerStatus`."""
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
@@ -434,7 +436,14 @@ def _lead_status(message: Message | None) -> LeadStatus | None:
     if not isinstance(message, PlannerStatus):
         return None
     mode = name_of(PlannerMode, message.mode)
-    return LeadStatus(mode, message.wait_s, message.margin, reason_of(message), message.session)
+    return LeadStatus(
+        mode,
+        message.wait_s,
+        message.margin,
+        reason_of(message),
+        message.session,
+        message.carried_n,
+    )
 
 
 def _tools_of(message: Message | None) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ def _describe_lead(lead: LeadStatus | None) -> str:
     """Return one line on the planner."""
     if lead is None:
         return "planner silent: each module holds by itself"
-    words = f"planner {lead.mode}, margin {lead.margin:.2f}"
+    words = f"planner {lead.mode}, margin {lead.margin:.2f}, carries {lead.carried_n:.0f} N"
     if lead.wait_s > 0.0:
         words += f"; leads again in {lead.wait_s:.0f} s at the earliest, after drop-outs or trips"
     if lead.why:

@@ -26,6 +26,7 @@ from shared.joints import MODULES
 from shared.mcap_log.sequence_stats import KeyCount
 from tools.fleet.stalls import Disturbance, disturbances, goes_to_hold, inside, stalls_of
 from tools.judge.standing import soundness, tracking, why_not_sound, why_not_standing
+from tools.judge.wearer import WearerFigures, merged_figures, wearer_figures
 from tools.logs.impairment_intervals import Impaired, impairments, touches
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, parts_of, robot_of
@@ -147,6 +148,8 @@ class Summary(msgspec.Struct, kw_only=True):
     """Up to the end of the last part; so are the gaps."""
     sequence_gaps: int = 0
     stalls: Annotated[list[ShownStall], _each_stall] = []
+    wearer: Annotated[WearerFigures | None, merged_figures] = None
+    """What it did for the person; None without a harness."""
     fleet_cpu_pct: float | None = None
     """Of a live run."""
     speed: float | None = None
@@ -296,6 +299,7 @@ def _add_end(
     with contextlib.suppress(RunError, ConfigError):  # none in the log, or of another version
         robot = robot_of(log)
     if robot is not None:
+        summary.wearer = wearer_figures(log, robot, truth[0].t_ns)
         for name, value in soundness(log, truth, robot)._asdict().items():
             setattr(summary, name, value)
         summary.why_not = why_not_standing(last, robot) if reached else ""

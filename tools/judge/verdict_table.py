@@ -40,7 +40,8 @@ def show(summary: Summary, console: Console) -> None:
             f"and {decide}.",
             style="dim",
         )
-    for line in (*stalls(summary), *network(summary)):
+    wearer = [] if summary.wearer is None else [summary.wearer.describe()]
+    for line in (*wearer, *stalls(summary), *network(summary)):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if summary.pace != 1.0:
         console.print(

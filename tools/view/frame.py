@@ -76,6 +76,8 @@ class PlannerShown(msgspec.Struct, frozen=True):
     """COM height that it follows, m."""
     heat_left_s: float = -1.0
     """Seconds left at this load, as in `PlannerStatus`."""
+    carried_n: float = 0.0
+    """As in `PlannerStatus`."""
 
 
 class ShownProcess(msgspec.Struct, frozen=True):
@@ -265,6 +267,7 @@ def _shown(status: PlannerStatus) -> PlannerShown:
         assist_n=status.assist_n,
         height_ref=status.p_ref[2],
         heat_left_s=status.heat_left_s,
+        carried_n=status.carried_n,
     )
 
 

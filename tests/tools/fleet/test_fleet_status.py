@@ -111,10 +111,13 @@ def test_a_module_without_states_is_not_guessed_at() -> None:
     ("lead", "words"),
     [
         (None, "planner silent: each module holds by itself"),
-        (LeadStatus("LEADING", 0.0, 1.2), "planner LEADING, margin 1.20"),
+        (LeadStatus("LEADING", 0.0, 1.2), "planner LEADING, margin 1.20, carries 0 N"),
         (LeadStatus("ALIGNING", 12.3, 1.2), "leads again in 12 s"),
-        (LeadStatus("MISPLACED", 0.0, 1.2, "a foot is ahead"), "margin 1.20; a foot is ahead"),
-        (LeadStatus("FALLEN", 0.0, 1.2, "it has fallen (apart)"), "FALLEN, margin 1.20; it has"),
+        (
+            LeadStatus("MISPLACED", 0.0, 1.2, "a foot is ahead"),
+            "carries 0 N; a foot is ahead",
+        ),
+        (LeadStatus("FALLEN", 0.0, 1.2, "it has fallen (apart)"), "planner FALLEN, margin 1.20"),
     ],
 )
 def test_whether_the_planner_leads_and_why_not_is_reported(

@@ -16,6 +16,7 @@ from shared.toml_file import decoded
 from tools.judge import verdict, verdict_table
 from tools.judge.reports.run_data import RunData
 from tools.judge.verdict import Summary
+from tools.judge.wearer import WearerFigures, merged_figures, wearer_figures
 from tools.terminal import Console
 
 MACHINE: Final = {
@@ -34,6 +35,8 @@ class RunVerdict(NamedTuple):
     """(figure, measured, limit, `ok` or `over`, the latter possibly with the reason)."""
     caution: str = ""
     """Reason not to trust the figures."""
+    wearer: str = ""
+    """What it did for the person, in a line."""
 
 
 class Judge:
@@ -41,12 +44,15 @@ class Judge:
 
     def __init__(self) -> None:
         self._summaries: list[Summary] = []
+        self._wearer: list[WearerFigures] = []
         self._why_not = ""
 
     def add(self, run: RunData, counts: dict[str, KeyCount]) -> None:
         """Add a run, or the next part of it; `counts` are of all messages up to its end."""
         if run.course is None:
             self._why_not = self._why_not or run.without_course
+            if run.robot is not None and (found := wearer_figures(run.log, run.robot)):
+                self._wearer.append(found)
             return
         try:
             planned = _scenario_of(run).get("duration")
@@ -59,11 +65,15 @@ class Judge:
     def verdict(self, *, whole: bool = True) -> RunVerdict:
         """Return the verdict; a part of a run (`whole` is False) has figures alone."""
         if not self._summaries:
-            return RunVerdict(f"No verdict: {self._why_not}", None, [])
+            said = merged_figures(self._wearer).describe() if self._wearer else ""
+            return RunVerdict(f"No verdict: {self._why_not}", None, [], wearer=said)
         summary = verdict.merged(self._summaries)
-        rows = verdict_table.rows(summary)
+        rows, said = verdict_table.rows(summary), ""
+        if summary.wearer is not None:
+            said = summary.wearer.describe()
         if not whole:
-            return RunVerdict("A part of a run, and its figures: no verdict", None, rows)
+            what = "A part of a run, and its figures: no verdict"
+            return RunVerdict(what, None, rows, wearer=said)
         text = io.StringIO()
         console = Console(file=text, width=200, color_system=None, soft_wrap=True)
         verdict_table.show(summary, console)
@@ -71,7 +81,7 @@ class Judge:
         cautions = verdict_table.stalls(summary)
         cautions += [] if summary.in_real_time else [lines[-2]]
         caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
-        return RunVerdict(lines[-1], summary.sound, rows, caution)
+        return RunVerdict(lines[-1], summary.sound, rows, caution, said)
 
 
 def _scenario_of(run: RunData) -> dict[str, Any]:
@@ -97,13 +107,18 @@ def verdict_and_facts(
         table = _details(f"Figures against their limits: {count}", cells, is_open=True)
     facts = "".join(
         f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>"
-        for key, value in _facts(run, counts)
+        for key, value in (*_facts(run, counts), *_wearer(found))
     )
     return (
         f"<header><h1>{escape(run.log.robot)}: {escape(name)}</h1>"
         f'<p class="verdict {word}" id="verdict">{escape(found.sentence)}</p>{caution}'
         f'<div class="head">{table}<dl>{facts}</dl></div></header>'
     )
+
+
+def _wearer(found: RunVerdict) -> list[tuple[str, str]]:
+    name, _, figures = found.wearer.partition(": ")
+    return [(name.lower(), figures)] if figures else []
 
 
 def _facts(run: RunData, counts: dict[str, KeyCount]) -> list[tuple[str, str]]:

@@ -171,7 +171,7 @@ function show(frame) {
   $("planner").textContent = planner
     ? [planner.why, planner.wait_s > 0 ? `leads again in ${planner.wait_s.toFixed(0)} s at the earliest` : "",
       planner.heat_left_s >= 0 && planner.heat_left_s < 3600 ? `motors: ${planner.heat_left_s.toFixed(0)} s left at this load` : "",
-      `tick ${planner.tick_us?.toFixed(0) ?? "-"} µs, assist ${planner.assist_n.toFixed(0)} N`]
+      `tick ${planner.tick_us?.toFixed(0) ?? "-"} µs, assist ${planner.assist_n.toFixed(0)} N, carries ${planner.carried_n.toFixed(0)} N`]
       .filter(Boolean).join("; ")
     : "not heard: each module holds by itself";
   frame.modes.forEach((mode, index) => {

@@ -1,0 +1,239 @@
+"""What a robot did for the person who wears it, from any log that has harness, planner and joints.
+
+Definitions (docs/law.md#wearer), with f the upward force and m the moment about pitch of the person
+on the robot at the harness, M the payload with the load that the planner found beyond it, A the
+assist that is requested, v and omega the rates of the harness point and of the torso's pitch:
+
+    carried = M g - f          what the robot bears of payload and person, N
+    asked   = M g + A
+    share   = mean(carried) / mean(asked)
+    work    = integral of max(0, f v + m omega)      by the person, J
+    bump    = |f - f, low-passed by `SLOW_S`| > `BUMP_N` for less than `BUMP_S`
+    resting : -f > `RESTS_N` while the robot is still
+
+Forces are those of a hand too: while it leads, the person's push up or down is missing or added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from services.planner.law.assist import STILL_RATE_PITCH, STILL_RATE_Z
+from services.planner.law.hocca import KNEES
+from services.planner.law.kinematics import Kinematics
+from shared.arrays import Array
+from shared.bus import topics
+from shared.bus.messages import JointState, PlannerMode, PlannerStatus, Wrench
+from shared.clock import NS_PER_S
+from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.joints import MODULES
+from tools.logs.run_log import RunLog
+
+SLOW_S: Final = 0.3
+BUMP_N: Final = 22.0
+"""N; a led squat peaks there."""
+BUMP_S: Final = 0.05
+RESTS_N: Final = 20.0
+BENT: Final = -1.25
+"""rad; more bent knees are a working pose, and so is a torso pitched by more than `PITCHED`."""
+PITCHED: Final = 0.3
+GRID_S: Final = 0.04
+"""Rates are differences over this time."""
+PHASES: Final = ("stand", "down", "work", "up")
+
+
+class _Phase(msgspec.Struct, frozen=True):
+    """Means over the time that a robot spent in a phase."""
+
+    seconds: float
+    carried_n: float
+    asked_n: float
+
+    @property
+    def share(self) -> float:
+        """Part of payload and assist that the robot carried."""
+        return self.carried_n / self.asked_n if self.asked_n else 0.0
+
+
+class WearerFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of a run, or of a part."""
+
+    phases: dict[str, _Phase]
+    """By `PHASES`, and `all`; those that did not occur are left out."""
+    work_j: float
+    force_rms_n: float
+    """Of the force on the person in all directions."""
+    force_peak_n: float
+    bumps: int
+    bump_peak_n: float
+    resting_s: float
+
+    def describe(self) -> str:
+        """Return them in a line."""
+        whole = self.phases["all"]
+        each = ", ".join(
+            f"{name} {100 * row.share:.0f} %" for name, row in self.phases.items() if name != "all"
+        )
+        bumps = f"{self.bumps} bumps of {self.bump_peak_n:.0f} N" if self.bumps else "no bumps"
+        return (
+            f"The wearer: it carried {100 * whole.share:.0f} % of {whole.asked_n:.0f} N ({each}); "
+            f"force {self.force_rms_n:.1f} N rms, {self.force_peak_n:.0f} N at most, "
+            f"{self.work_j:.1f} J of work, {bumps}, {self.resting_s:.1f} s of rest"
+        )
+
+
+class _Motion(NamedTuple):
+    """How the robot moved, by the ticks of the planner, `GRID_S` apart."""
+
+    t_ns: NDArray[np.int64]
+    phase: NDArray[np.intp]
+    """Index of `PHASES`."""
+    still: NDArray[np.bool_]
+    rates: Array
+    """(n, 2): harness point, m/s, and pitch, rad/s."""
+    turned: Array
+    """(n, 2): roll and pitch, rad."""
+    load: Array
+    """M g, N."""
+    assist: Array
+    """A, N."""
+
+
+def wearer_figures(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> WearerFigures | None:
+    """Return the figures from a time on, or from when the planner first led; None without data.
+
+    Args:
+        log: the run, or a part of one.
+        robot: the robot of the log.
+        from_ns: monotonic time; 0: when the planner first leads in it.
+    """
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    leads = (row.t_ns for row in statuses if row.mode == PlannerMode.LEADING)
+    from_ns = from_ns or next(leads, 1 << 62)
+    wrenches: list[Wrench] = [
+        row
+        for row in log.messages(topics.WRENCH)
+        if row.valid and row.t_ns >= from_ns and log.holds(row.t_ns)
+    ]
+    motion = _motion(log, robot, [row for row in statuses if row.t_ns >= from_ns])
+    if motion is None or len(wrenches) < 2:
+        return None
+    t_ns = np.array([row.t_ns for row in wrenches])
+    at = np.clip(np.searchsorted(motion.t_ns, t_ns, side="right") - 1, 0, None)
+    force = np.array([row.force for row in wrenches])
+    moment = np.array([row.moment[1] for row in wrenches])
+    roll, pitch = motion.turned[at].T
+    x, y, z = force.T
+    f = np.sin(roll) * y + np.cos(roll) * (z * np.cos(pitch) - x * np.sin(pitch))
+    dt = np.minimum(np.diff(t_ns, append=t_ns[-1]) / NS_PER_S, GRID_S)
+    power = f * motion.rates[at, 0] + moment * motion.rates[at, 1]
+    size = np.linalg.norm(force, axis=1)
+    bumps = _bumps(f, t_ns / NS_PER_S)
+    carried, asked = motion.load[at] - f, motion.load[at] + motion.assist[at]
+    return WearerFigures(
+        phases=_by_phase(motion.phase[at], dt, carried, asked),
+        work_j=float(np.maximum(0.0, power) @ dt),
+        force_rms_n=float(np.sqrt(np.average(size * size, weights=dt))),
+        force_peak_n=float(size.max()),
+        bumps=len(bumps),
+        bump_peak_n=max(bumps, default=0.0),
+        resting_s=float(dt[(-f > RESTS_N) & motion.still[at]].sum()),
+    )
+
+
+def merged_figures(parts: Sequence[WearerFigures]) -> WearerFigures:
+    """Return the figures of a run from those of its parts."""
+    seconds = [row.phases["all"].seconds for row in parts]
+    square = sum(s * row.force_rms_n**2 for s, row in zip(seconds, parts, strict=True))
+    phases = {
+        name: _mean([row.phases[name] for row in parts if name in row.phases])
+        for name in ("all", *PHASES)
+        if any(name in row.phases for row in parts)
+    }
+    return WearerFigures(
+        phases=phases,
+        work_j=sum(row.work_j for row in parts),
+        force_rms_n=float(np.sqrt(square / sum(seconds))),
+        force_peak_n=max(row.force_peak_n for row in parts),
+        bumps=sum(row.bumps for row in parts),
+        bump_peak_n=max(row.bump_peak_n for row in parts),
+        resting_s=sum(row.resting_s for row in parts),
+    )
+
+
+def _mean(rows: Sequence[_Phase]) -> _Phase:
+    seconds = sum(row.seconds for row in rows)
+    carried = sum(row.seconds * row.carried_n for row in rows) / seconds
+    return _Phase(seconds, carried, sum(row.seconds * row.asked_n for row in rows) / seconds)
+
+
+def _by_phase(
+    phase: NDArray[np.intp], dt: Array, carried: Array, asked: Array
+) -> dict[str, _Phase]:
+    found = {}
+    for name, inside in (
+        ("all", np.full(len(phase), True)),
+        *((name, phase == index) for index, name in enumerate(PHASES)),
+    ):
+        seconds = float(dt[inside].sum())
+        if seconds > 0.0:
+            means = [float(np.average(row[inside], weights=dt[inside])) for row in (carried, asked)]
+            found[name] = _Phase(seconds, *means)
+    return found
+
+
+def _motion(log: RunLog, robot: RobotConfig, statuses: Sequence[PlannerStatus]) -> _Motion | None:
+    every = max(1, round(GRID_S * robot.planner.rate_hz))
+    rows = statuses[::every]
+    states = [log.newest(topics.JOINT_STATE, module) for module in MODULES]
+    poses = [[one.at(row.t_ns) for one in states] for row in rows]
+    known = [i for i, pose in enumerate(poses) if None not in pose]
+    if len(known) < 3:
+        return None
+    rows = [rows[i] for i in known]
+    kinematics, heights, knees = Kinematics(robot), [], []
+    for i, row in zip(known, rows, strict=True):
+        seen: list[JointState | None] = poses[i]
+        q = np.array([state.q for state in seen if state is not None]).ravel()
+        kinematics.stance[:] = row.stance
+        kinematics.update(q)
+        heights.append(float(kinematics.r_harness[2]))
+        knees.append(max(q[list(KNEES)]))
+    t_ns = np.array([row.t_ns for row in rows])
+    p, pdot = np.array([row.p for row in rows]), np.array([row.pdot for row in rows])
+    up = np.gradient(np.array(heights), t_ns / NS_PER_S)
+    still = (np.abs(pdot[:, 2]) <= STILL_RATE_Z) & (np.abs(pdot[:, 4]) <= STILL_RATE_PITCH)
+    works = (np.array(knees) < BENT) | (p[:, 4] > PITCHED)
+    falls = np.where(np.abs(pdot[:, 2]) > STILL_RATE_Z, pdot[:, 2] < 0.0, pdot[:, 4] > 0.0)
+    stand, down, work, rise = range(len(PHASES))
+    phase = np.where(still, np.where(works, work, stand), np.where(falls, down, rise))
+    kg = robot.mass.payload + np.array([row.load[0] for row in rows])
+    return _Motion(
+        t_ns=t_ns,
+        phase=phase,
+        still=still,
+        rates=np.stack([up, pdot[:, 4]], axis=1),
+        turned=p[:, 3:5],
+        load=GRAVITY * kg,
+        assist=np.array([row.assist_requested_n for row in rows]),
+    )
+
+
+def _bumps(f: Array, t: Array) -> list[float]:
+    """Return the size of each bump, N."""
+    slow, fast = float(f[0]), np.zeros(len(f))
+    for index, (value, dt) in enumerate(zip(f.tolist(), np.diff(t, prepend=t[0]), strict=True)):
+        slow += min(1.0, dt / SLOW_S) * (value - slow)
+        fast[index] = value - slow
+    edges = np.diff(np.concatenate(([0], (np.abs(fast) > BUMP_N).astype(int), [0])))
+    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    return [
+        float(np.abs(fast[begin:end]).max())
+        for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
+        if t[end - 1] - t[begin] < BUMP_S
+    ]
