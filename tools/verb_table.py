@@ -126,6 +126,7 @@ VERBS: Final = (
             ("robust", "draw every error of the plant at once: who falls, and why"),
             ("latency", "compare three controls over bad networks: who falls, who leads"),
             ("push", "find the hardest push by direction, duration, pose and mode"),
+            ("wearer", "draw persons who rest, let go, go limp, bump: park off and on"),
         )
     ),
     Verb(

@@ -35,7 +35,7 @@ AT_LIMIT: Final = 0.995
 _NONE: Final = Event.NONE  # returned in each cycle: docs/contributing.md
 
 
-class TripLimits(msgspec.Struct, frozen=True):
+class _TripLimits(msgspec.Struct, frozen=True):
     """When a module trips."""
 
     slow_share: float
@@ -52,10 +52,10 @@ class TripLimits(msgspec.Struct, frozen=True):
     speed_ns: int
 
 
-def limits_of(config: RobotConfig) -> TripLimits:
+def limits_of(config: RobotConfig) -> _TripLimits:
     """Return the limits from the configuration."""
     trips, cycle_s = trip_table.limits_of(config), 1.0 / config.joint_service.rate_hz
-    return TripLimits(
+    return _TripLimits(
         slow_share=1.0 - math.exp(-2.0 * math.pi * SHAKE_ABOVE_HZ * cycle_s),
         mean_share=1.0 - math.exp(-cycle_s / SHAKE_S),
         shaking=trips.shaking.limit**2,
@@ -83,7 +83,7 @@ class JointTrips(msgspec.Struct):
         self.slow, self.mean = tau, (0.0, 0.0)
         self.at_limit_ns = self.fast_ns = 0
 
-    def judge(self, now_ns: int, tau: Pair, v: Pair, limits: TripLimits) -> Event:
+    def judge(self, now_ns: int, tau: Pair, v: Pair, limits: _TripLimits) -> Event:
         """Take one cycle of TRACK; return SHAKING, TORQUE_LIMIT, TOO_FAST or NONE.
 
         Args:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from shared.bus.messages import STRAIGHT, OperatorIntent, Vector4
+from shared.bus.messages import STRAIGHT, OperatorIntent, Park, Vector4
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import AssistConfig
 
@@ -27,6 +27,8 @@ class OperatorRequest(NamedTuple):
     """Name of the requester; "" if nobody requests anything, or the intent is stale."""
     sit: bool = False
     """Go down by itself to the lowest pose (`services.planner.law.closed_reference`)."""
+    park: int = Park.AUTO
+    """What is asked of a robot that may park (`services.planner.watch.park`)."""
 
 
 class Intents:
@@ -42,7 +44,7 @@ class Intents:
         """Store an intent that has arrived; ignore one with a value that cannot be."""
         if all(map(math.isfinite, (intent.assist_n, *intent.shift))):
             self._request = OperatorRequest(
-                intent.assist_n, intent.shift, intent.source, intent.sit
+                intent.assist_n, intent.shift, intent.source, intent.sit, intent.park
             )
             self._received_ns = now_ns
 

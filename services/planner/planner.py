@@ -17,12 +17,13 @@ from services.planner.intents import OperatorRequest
 from services.planner.law.assist import Overload, OverloadState, force_up
 from services.planner.law.closed_reference import Toward
 from services.planner.law.feet import Soles
-from services.planner.law.hocca import Hocca, LawInputs, LawOutput, LawState
+from services.planner.law.hocca import KNEES, Hocca, LawInputs, LawOutput, LawState
 from services.planner.law.load import LoadState
 from services.planner.state_phases import PhasesState, StatePhases
 from services.planner.watch.controller_guard import ControllerGuard, GuardState
 from services.planner.watch.engagement_fsm import Engagement, LimpLegWatch, RivalWatch
 from services.planner.watch.fallen import FallState, FallWatch, Seen
+from services.planner.watch.park import SHED_RATE, ParkLaw, ParkState, Touch
 from services.planner.watch.plausible import HarnessTrust, Plausible
 from services.planner.watch.reserves import HeatWatch, HeatWatchState, SupplyState, SupplyWatch
 from services.planner.watch.trips import PlannerTrips, TripsState, values_of
@@ -93,6 +94,8 @@ class PlannerState(msgspec.Struct, kw_only=True):
     unattended: Unattended = msgspec.field(default_factory=Unattended)
     trips: TripsState = msgspec.field(default_factory=TripsState)
     fall: FallState = msgspec.field(default_factory=FallState)
+    park: ParkState = msgspec.field(default_factory=ParkState)
+    """Changes only where the robot may park."""
 
 
 class Inputs(NamedTuple):
@@ -162,6 +165,7 @@ class Planner:
         self._overload = Overload(config.harness)
         self._trips = PlannerTrips(config)
         self._fall = FallWatch(config)
+        self._park = ParkLaw(config.park, config.assist)
         self._soles = Soles(config)
         self._heat = HeatWatch(config.heat)
         self._supply = SupplyWatch(config.supply)
@@ -298,8 +302,12 @@ class Planner:
     def _run_law(self, inputs: Inputs, assist_requested: float) -> LawOutput:
         """Return the output of the law, or of a controller of your own in its place."""
         s, dt = self.state, inputs.dt
+        if self._park.enabled:
+            parked = s.trust.scale * self._parked_assist(inputs)
+            assist_requested = max(assist_requested, parked)
         heat = self._heat.advance(s.heat, inputs.now_ns, inputs.states, assist_requested, dt)
         self._supply.advance(s.supply, inputs.states, dt)
+        height, pitch = s.unattended.released
         output = self._law.tick(
             s.law,
             LawInputs(
@@ -307,9 +315,10 @@ class Planner:
                 inputs.v,
                 dt,
                 assist=heat.assist,
+                shed_rate=SHED_RATE if s.park.closed else 0.0,
                 shift=inputs.request.shift,
                 toward=self._toward(heat.toward),
-                released=s.unattended.released,
+                released=(height or s.park.closed, pitch or s.park.closed),
                 pitch_drive=s.unattended.pitch.drive,
                 # until all engage, the law restarts from the measured pose: there is no step
                 align=s.engagement.hold,
@@ -334,6 +343,24 @@ class Planner:
             law=output,
         )
         return self._guard.act(s.guard, seen, leads=not s.engagement.hold)
+
+    def _parked_assist(self, inputs: Inputs) -> float:
+        """Return the assist that a parked robot gives, N; decide whether it is parked."""
+        s, wrench, output = self.state, inputs.wrench, self._output
+        touch = None
+        if wrench is not None and output is not None and s.heat.lifted is not None:
+            right, left = KNEES
+            knee = max(float(inputs.q[right]), float(inputs.q[left]))
+            kg = s.law.load.kg - s.trust.load[0]
+            z, pitch = float(output.pdot[2]), float(output.pdot[4])
+            touch = Touch(
+                s.heat.lifted, wrench.moment[1], wrench.force[:2],
+                (knee, float(output.p[4]), kg), (z, pitch),
+            )  # fmt: skip
+        may = not s.engagement.hold and inputs.request.assist_n == 0.0
+        may = may and not self._sits and not s.heat.moves
+        park = inputs.request.park
+        return self._park.advance(s.park, inputs.now_ns, touch, park, inputs.dt, may=may)
 
     def _watch(self, inputs: Inputs, output: LawOutput) -> None:
         """Estimate the load, and check the trips at the measured pose."""
@@ -530,6 +557,8 @@ class Planner:
             heat=int(s.heat.action),
             heat_left_s=s.heat.left_s,
             supply_v=s.supply.volts,
+            wearer=int(s.park.shown(now_ns)) if self._park.enabled else 0,
+            park_requested=int(s.request.park),
             carried_n=GRAVITY * (self._payload + load.kg) - (s.heat.lifted or 0.0),
         )
 

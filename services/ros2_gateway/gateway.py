@@ -22,7 +22,7 @@ INPUTS: Final = (topics.JOINT_STATE, topics.PLANNER_STATUS, topics.WRENCH)
 """Topics of the robot that are received."""
 
 
-class Outgoing(NamedTuple):
+class _Outgoing(NamedTuple):
     """A message for ROS 2."""
 
     topic: RosTopic
@@ -87,15 +87,15 @@ class Gateway:
         """Topics that have a rate, and the description."""
         return [*(topic for topic, _, _ in self._sends), self.topics.description]
 
-    def description(self) -> Outgoing:
+    def description(self) -> _Outgoing:
         """Return the robot's description, to be sent once at the start."""
-        return Outgoing(self.topics.description, self._convert.text(urdf(self._config)))
+        return _Outgoing(self.topics.description, self._convert.text(urdf(self._config)))
 
     def receive(self, topic: Topic, module: str, message: Message, now_ns: int) -> None:
         """Store a message of the robot that has arrived."""
         self._newest[topic, module] = now_ns, message
 
-    def due(self, now_ns: int, unix_ns: int) -> list[Outgoing]:
+    def due(self, now_ns: int, unix_ns: int) -> list[_Outgoing]:
         """Return what is to be sent now: at `unix_ns` for ROS 2, by the clock of `receive` here."""
         found = []
         for topic, period_ns, make in self._sends:
@@ -106,7 +106,7 @@ class Gateway:
             self._next_ns[topic] = due_ns + (1 + late) * period_ns
             payload = make(now_ns, unix_ns)
             if payload is not None:
-                found.append(Outgoing(topic, payload))
+                found.append(_Outgoing(topic, payload))
         return found
 
     def _at(self, topic: Topic, module: str, now_ns: int) -> Any | None:

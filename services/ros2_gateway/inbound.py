@@ -23,7 +23,7 @@ GIVE_UP_NS: Final = 5 * NS_PER_S
 """Maximum time for which a stop is repeated while modules have not stopped, ns."""
 
 
-class InboundTopics(NamedTuple):
+class _InboundTopics(NamedTuple):
     """Topics of a robot that ROS 2 may publish."""
 
     estop: RosTopic
@@ -32,10 +32,10 @@ class InboundTopics(NamedTuple):
     """`std_msgs/msg/Float64`: assist, N; to be repeated, as `assist.stale_ms` says."""
 
 
-def inbound_topics(namespace: str) -> InboundTopics:
+def inbound_topics(namespace: str) -> _InboundTopics:
     """Return them, in a namespace such as `legs`, or in none."""
     below = f"/{namespace}" if namespace else ""
-    return InboundTopics(
+    return _InboundTopics(
         RosTopic(f"{below}/xrl/estop", "std_msgs/msg/Bool"),
         RosTopic(f"{below}/xrl/intent", "std_msgs/msg/Float64"),
     )

@@ -40,7 +40,7 @@ class Mode(IntEnum):
     TRACK = 2
     """Follows the planner's commands."""
     DAMP = 3
-    """After an emergency stop: sinks slowly. After a fall: only damps."""
+    """After an emergency stop: sinks slowly; after a fall: only damps."""
     FAULT = 4
     """The drive, or its position, is lost; left by a restart only."""
 
@@ -200,8 +200,7 @@ class PlannerMode(IntEnum):
     """The load is farther from the robot file than `law.load_correction`, or not yet weighed after
     hanging on a hoist: all hold."""
     YIELDING = 8
-    """Another planner leads: this one sends no command that a module could use until that one has
-    ended."""
+    """Another planner leads: this one sends no command that a module could use until it ends."""
     FALLEN = 9
     """The robot has fallen: all are to go limp, until a person has re-armed them."""
 
@@ -216,6 +215,29 @@ class HeatAction(IntEnum):
     """It stands up by itself; height and pitch are not the person's."""
     RESTS = 3
     """It stays straight until it has cooled; height and pitch are not the person's."""
+
+
+class Park(IntEnum):
+    """What is asked of a robot that may park (docs/law.md#park); OPEN is a button."""
+
+    AUTO = 0
+    NEVER = 1
+    OPEN = 2
+
+
+class Wearing(IntEnum):
+    """What the planner makes of the person (`services.planner.watch.park`)."""
+
+    LEADS = 0
+    """Height and pitch are the person's."""
+    RESTS = 1
+    """Parked: the assist follows what rests on the harness."""
+    AWAY = 2
+    """Nobody touches the harness: closed."""
+    PULLS = 3
+    """Somebody pulls along the floor; changes nothing."""
+    BUMPED = 4
+    """A blow too short to open it."""
 
 
 class SplitSource(IntEnum):
@@ -495,8 +517,7 @@ class PlannerStatus(Message, frozen=True):
     """Place of the right foot relative to the left, as deviation from the robot file: x, y, z, m,
     and a rotation vector, rad, world axes."""
     why: str = ""
-    """Reason for not leading, in words, where the mode does not say it all; before it what is wrong
-    with the supply."""
+    """Why it does not lead, where the mode does not say it all; first what ails the supply."""
     trip: Int64 = 0
     """Trip for which it does not lead."""
     load: Vector3 = (0.0, 0.0, 0.0)
@@ -515,8 +536,11 @@ class PlannerStatus(Message, frozen=True):
     supply_v: float = 0.0
     """Lowest voltage of the drives' supplies, V, low-passed; 0: not known."""
     carried_n: float = 0.0
-    """Weight of the payload, and of the load that was found beyond it, less the person's upward
-    force on the harness, N (docs/law.md#wearer); without the harness the payload's alone."""
+    """Payload and person that it carries, N (docs/law.md#wearer); without a harness the payload."""
+    wearer: Int64 = 0
+    """What the planner makes of the person; 0 where it may not park."""
+    park_requested: Int64 = 0
+    """What the person asks of a robot that may park."""
 
 
 class OperatorIntent(Message, frozen=True):
@@ -530,6 +554,8 @@ class OperatorIntent(Message, frozen=True):
     """Name of the sender."""
     sit: bool = False
     """The robot is to go down by itself to its lowest pose, and hold there (`xrl down`)."""
+    park: Int64 = 0
+    """What is asked of a robot that may park."""
 
 
 class HandLead(Message, frozen=True):

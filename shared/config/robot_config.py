@@ -57,6 +57,7 @@ class RobotConfig(Section, frozen=True):
     trips: sections.TripsConfig = sections.TripsConfig()
     heat: sections.HeatConfig = sections.HeatConfig()
     supply: sections.SupplyConfig = sections.SupplyConfig()
+    park: sections.ParkConfig = sections.ParkConfig()
     ros2: sections.Ros2Config = sections.Ros2Config()
     gain_schedule: GainSchedule | None = None
     """Not in this file but beside it; None if it has not been made."""

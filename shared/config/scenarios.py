@@ -57,6 +57,25 @@ class Push(Section, frozen=True):
     force: tuple[Force, Force, Force]
 
 
+class Act(Section, frozen=True):
+    """What the person does beside leading, without asking the robot for anything.
+
+    rest: puts weight on the harness; relax: the same, and the hand holds with a quarter of its
+    strength; limp: the same, and the hand holds nothing; bump: a blow, half a sine; pull: along x;
+    tremor: shakes at 6 Hz; let_go: takes the hand off.
+    """
+
+    kind: Literal["rest", "relax", "limp", "bump", "pull", "tremor", "let_go"]
+    at: Time
+    duration: Annotated[float, Range(0.001, 3600.0, "s")]
+    force: Force = 0.0
+    """N; down for a weight, up for a bump, forwards for a pull."""
+    ramp: Annotated[float, Range(0.0, 60.0, "s")] = 0.2
+    """Time in which it comes, s; a bump has none."""
+    release: Annotated[float, Range(0.0, 60.0, "s")] | None = None
+    """Time in which it goes, s; by default as `ramp`."""
+
+
 class Kill(Section, frozen=True):
     """A signal to a service. It stays down until a `Restart` names it."""
 
@@ -163,6 +182,7 @@ class Scenario(Section, frozen=True):
     hand: bool = True
     """False: the operator lets go; nothing leads."""
     push: tuple[Push, ...] = ()
+    act: tuple[Act, ...] = ()
     kill: tuple[Kill, ...] = ()
     restart: tuple[Restart, ...] = ()
     fault: tuple[Fault, ...] = ()
@@ -261,8 +281,8 @@ def _problems(scenario: Scenario) -> Iterator[tuple[str, str, str]]:
         if b <= a:
             found = f"at {b:g} s does not follow {a:g} s"
             yield f"keyframe[{index + 1}].at", found, "times must rise"
-    for kind in ("kill", "restart", "push", "fault", "inject"):
-        rows: Sequence[Kill | Restart | Push | Fault | Inject] = getattr(scenario, kind)
+    for kind in ("kill", "restart", "push", "act", "fault", "inject"):
+        rows: Sequence[Kill | Restart | Push | Act | Fault | Inject] = getattr(scenario, kind)
         for index, row in enumerate(rows):
             where = f"{kind}[{index}]"
             if isinstance(row, Kill | Restart) and row.service not in SERVICES:
@@ -301,7 +321,7 @@ def _fault_problems(where: str, fault: Fault) -> Iterator[tuple[str, str, str]]:
 def to_toml(scenario: Scenario) -> str:
     """Return the scenario as TOML that `load` reads back."""
     table = msgspec.to_builtins(scenario)
-    for row in (*table["keyframe"], *table["fault"], *table["inject"]):
+    for row in (*table["keyframe"], *table["act"], *table["fault"], *table["inject"]):
         for key in [key for key, value in row.items() if value is None]:
             del row[key]  # TOML has no null
     return tomli_w.dumps(table)

@@ -185,6 +185,18 @@ class AssistConfig(Section, frozen=True):
     fade_s: Annotated[float, Range(0.5, 60.0, "s")] = 5.0
 
 
+class ParkConfig(Section, frozen=True):
+    """Lets a person rest on a robot that stands still, crouched (docs/law.md#park)."""
+
+    enabled: bool = False
+    open_n: Annotated[float, Range(10.0, 100.0, "N")] = 22.0
+    """Net pull up that opens it; the peak of a led squat."""
+    open_back_nm: Annotated[float, Range(2.0, 50.0, "N m")] = 6.0
+    """Moment backwards that opens it."""
+    still_s: Annotated[float, Range(0.1, 5.0, "s")] = 0.35
+    """Time for which it must be still before it parks."""
+
+
 LocalStiffness = Annotated[float, Range(0.0, 1e4, "N m/rad")]
 LocalDamping = Annotated[float, Range(0.0, 1e3, "N m s/rad")]
 
@@ -501,6 +513,8 @@ class OperatorConfig(Section, frozen=True):
     k_y: Annotated[float, Range(0.0, 1e5, "N/m")] = 1500.0
     """Sideways, where a scenario holds the harness point (`side`)."""
     b_y: Annotated[float, Range(0.0, 1e4, "N s/m")] = 150.0
+    soft_n: Annotated[float, Range(0.0, 1e4, "N")] = 0.0
+    """N; a harness that softens as it is stretched gives no more along z. 0: it is linear."""
 
 
 class SimulationConfig(Section, frozen=True):

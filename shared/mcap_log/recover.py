@@ -65,7 +65,7 @@ class Interrupted(Exception):  # noqa: N818 - not an error: the recorder is to s
     """The recovery was interrupted; the original is unchanged."""
 
 
-class RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
+class _RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
     """Outcome of a recovery: what it kept and what it lost."""
 
     out: Path
@@ -113,7 +113,7 @@ def is_whole(path: Path) -> bool:
         )
 
 
-def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult:
+def recover(path: Path, out: Path, stop: Stop = lambda: False) -> _RecoveryResult:
     """Copy what can be read of a file into a finished one, which then replaces `out`.
 
     `stop` is called between chunks; True interrupts. Raises RunError if the file cannot be read or
@@ -133,7 +133,7 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
                 f"{out}: cannot be written: {error.strerror or error}; {path} is as it was; "
                 "free space there, or recover elsewhere with -o"
             ) from None
-    return RecoveryResult(
+    return _RecoveryResult(
         out=out,
         finished=reader.finished,
         messages=copy.counts.message_count,
@@ -149,7 +149,7 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> RecoveryResult
     )
 
 
-def describe(outcome: RecoveryResult) -> list[str]:
+def describe(outcome: _RecoveryResult) -> list[str]:
     """Return one line for what was kept and one for each loss."""
     kept = f"{outcome.messages} messages"
     if outcome.messages:

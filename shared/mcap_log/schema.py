@@ -34,6 +34,9 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.JointState, "refusal"): messages.Refusal,
     (messages.PlannerStatus, "trip"): messages.Trip,
     (messages.PlannerStatus, "heat"): messages.HeatAction,
+    (messages.PlannerStatus, "wearer"): messages.Wearing,
+    (messages.PlannerStatus, "park_requested"): messages.Park,
+    (messages.OperatorIntent, "park"): messages.Park,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
 """Fields that are plain integers on the bus and enumerations in the mind."""

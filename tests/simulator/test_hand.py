@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from services.simulator.physics import operator as hands
+from services.simulator.physics.body import body_of
 from services.simulator.physics.operator import LedHand, Operator, Wearer
 from services.simulator.physics.plant import IDEAL, Person
+from services.simulator.physics.world import World
 from shared.bus.messages import HandLead
 from shared.config.robot_config import RobotConfig
-from shared.config.scenarios import Lead
+from shared.config.scenarios import Act, Lead
+from tests.lockstep.runs import still
 
 DT = 0.001
 NOW = Lead(1.1, -0.05, 0.1, 0.02, 30.0)
@@ -152,3 +156,63 @@ def test_the_wearer_gives_way_by_weight_on_springs_and_rests_later_and_less_than
     assert worn(person, 0.0, 200.0, 0.2).load_n == pytest.approx(0.9 * 200.0 * 0.632, rel=0.01)
     assert worn(person, 0.0, 200.0).load_n == pytest.approx(180.0, rel=1e-3)
     assert worn(IDEAL.person, 0.0, 200.0, 1e-3).load_n == 200.0
+
+
+def act(kind: str, force: float = 0.0, **more: float) -> Act:
+    return msgspec.convert({"kind": kind, "at": 1.0, "duration": 2.0, "force": force} | more, Act)
+
+
+@pytest.mark.parametrize(
+    ("kind", "grip"), [("rest", 1.0), ("relax", hands.RELAXED), ("limp", 0.0), ("let_go", 0.0)]
+)
+def test_a_weight_comes_and_goes_within_its_ramp_and_the_hand_holds_as_its_kind_says(
+    kind: str, grip: float
+) -> None:
+    acts = [act(kind, 100.0, ramp=0.5)]
+    for t, share in ((0.99, 0.0), (1.25, 0.5), (1.6, 1.0), (2.4, 1.0), (2.75, 0.5), (3.0, 0.0)):
+        found = hands.acting(acts, t)
+        assert found.load == pytest.approx(0.0 if kind == "let_go" else share * 100.0)
+        held = 1.0 + share * (grip - 1.0)
+        inside = 1.0 <= t < 3.0
+        assert found.grip == pytest.approx(float(not inside) if grip == 0.0 else held)
+
+
+def test_a_weight_may_go_faster_than_it_came() -> None:
+    acts = [act("rest", 100.0, ramp=1.0, release=0.2)]
+    assert hands.acting(acts, 1.5).load == pytest.approx(50.0)
+    assert hands.acting(acts, 2.9).load == pytest.approx(50.0)
+
+
+def test_bumps_tremor_and_a_pull_are_forces_and_add_up() -> None:
+    assert hands.acting([act("bump", 60.0, duration=0.04)], 1.02).up == pytest.approx(60.0)
+    assert hands.acting([act("bump", 60.0, duration=0.04)], 1.041) == hands.NO_ACT
+    quarter = 1.0 + 1.25 / hands.TREMOR_HZ
+    assert hands.acting([act("tremor", 8.0)], quarter).up == pytest.approx(8.0)
+    both = [act("pull", -30.0), act("rest", 50.0), act("rest", 20.0)]
+    assert hands.acting(both, 2.0) == hands.Acting(load=70.0, ahead=-30.0)
+
+
+def test_a_harness_that_softens_gives_no_more_than_its_limit(robot: RobotConfig) -> None:
+    at = 1.1 + robot.geometry.harness_point[2]
+    soft = msgspec.structs.replace(robot.simulation.operator, soft_n=50.0)
+    linear = Operator(robot.simulation.operator, robot.geometry.harness_point)
+    softens = Operator(soft, robot.geometry.harness_point)
+    for below in (0.001, 0.09):
+        spring = linear.force(LEVEL, at - below, 0.0, 0.0, 0.0).force_z
+        found = softens.force(LEVEL, at - below, 0.0, 0.0, 0.0).force_z
+        assert found == pytest.approx(spring * 50.0 / (50.0 + spring))
+
+
+def test_the_harness_feels_a_pull_where_the_person_is(robot: RobotConfig) -> None:
+    scenario = msgspec.structs.replace(still(2.0), act=(act("pull", 40.0, at=0.0, ramp=0.0),))
+    world = World(body_of(robot, IDEAL), scenario)
+    world.remove_hoist()
+    world.start()
+    world.step(np.zeros(12))
+    outside = world.outside
+    assert outside.harness_force[0] == pytest.approx(40.0, abs=0.1)
+    assert world.data.xfrc_applied[world.model.body("torso").id][0] == pytest.approx(40.0)
+    turns = world.data.xfrc_applied[world.model.body("torso").id][4] - outside.hand.moment_pitch
+    x, _, z = robot.geometry.harness_point
+    lifts = outside.hand.force_z - outside.wearer.load_n
+    assert turns == pytest.approx(z * 40.0 - x * lifts, rel=0.01)

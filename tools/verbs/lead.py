@@ -12,7 +12,7 @@ from rich.text import Text
 
 from shared.bus import topics
 from shared.bus.credentials import require_operator
-from shared.bus.messages import HandLead, OperatorIntent, PlannerStatus
+from shared.bus.messages import HandLead, OperatorIntent, Park, PlannerStatus
 from shared.bus.session import Session, open_session
 from shared.bus.traces import SimTruth
 from shared.clock import now_ns
@@ -46,6 +46,7 @@ class Key(Enum):
     BACK = (0.0, -1.0, 0.0)
     MORE = (0.0, 0.0, 1.0)
     LESS = (0.0, 0.0, -1.0)
+    OPEN = (0.0, 0.0, 0.0, "o")
     STOP = (0.0, 0.0, 0.0, "x")
     QUIT = (0.0, 0.0, 0.0, "q")
 
@@ -53,13 +54,14 @@ class Key(Enum):
 KEYS: Final = {
     b"\x1b[A": Key.UP, b"\x1bOA": Key.UP, b"\x1b[B": Key.DOWN, b"\x1bOB": Key.DOWN,
     b"\x1b[C": Key.FORWARD, b"\x1bOC": Key.FORWARD, b"\x1b[D": Key.BACK, b"\x1bOD": Key.BACK,
-    b"+": Key.MORE, b"=": Key.MORE, b"-": Key.LESS, b"x": Key.STOP, b" ": Key.STOP, b"q": Key.QUIT,
+    b"+": Key.MORE, b"=": Key.MORE, b"-": Key.LESS, b"o": Key.OPEN,
+    b"x": Key.STOP, b" ": Key.STOP, b"q": Key.QUIT,
 }  # fmt: skip
 
 
 EXAMPLES: Final = """
 xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
-xrl lead --keys          # arrows: height and pitch; + and -: assist; space: stop
+xrl lead --keys          # arrows: height and pitch; +, -: assist; o: unpark; space: stop
 xrl lead --pad Xbox --hold leftshoulder --stop x
 """
 
@@ -149,10 +151,22 @@ class _Leader:
                     push=(0.0, 0.0, 0.0), source=self._source,
                 )
             )  # fmt: skip
-        if led.assist_n > 0.0 and not self.other:
+        if led.assist_n > 0.0:
+            self._ask(led.assist_n)
+
+    def open(self) -> None:
+        """Ask a parked robot to be led again."""
+        self._sent += 1
+        self._ask(self.pilot.led.assist_n, Park.OPEN)
+
+    def _ask(self, assist_n: float, park: Park = Park.AUTO) -> None:
+        if not self.other:
             self._intents.put(
-                OperatorIntent(t_ns=now, seq=self._sent, assist_n=led.assist_n, source=self._source)
-            )
+                OperatorIntent(
+                    t_ns=now_ns(), seq=self._sent, assist_n=assist_n, source=self._source,
+                    park=int(park),
+                )
+            )  # fmt: skip
 
     def describe(self, held: str) -> Text:
         """Return what is led and what the robot does, as one line."""
@@ -203,7 +217,9 @@ def _by_keys(leader: _Leader, console: Console) -> Key | None:
     with Keyboard(KEYS) as keyboard:
         if not keyboard.present:
             raise FleetError("no terminal to read keys from; a gamepad leads without --keys")
-        console.print("arrows: height and pitch; + and -: assist; space or x: STOP; q ends it")
+        console.print(
+            "arrows: height and pitch; + and -: assist; o: open; space or x: STOP; q ends it"
+        )
         last = time.monotonic()
         with Live(console=console, refresh_per_second=4, transient=True) as shown:
             while not stop and keyboard.present:
@@ -212,6 +228,8 @@ def _by_keys(leader: _Leader, console: Console) -> Key | None:
                     return Key.STOP
                 if Key.QUIT in presses:
                     return None
+                if Key.OPEN in presses:
+                    leader.open()
                 now = time.monotonic()
                 leader.lead(_deflection_of(presses), min(now - last, KEY_HELD_S))
                 last = now

@@ -66,7 +66,7 @@ class AxesStatus:
         return int(errors if wanted_armed else errors & ~AxisError.WATCHDOG_TIMER_EXPIRED)
 
 
-class EndpointBatch:
+class _EndpointBatch:
     """Endpoints of a drive that are read or written together, in order.
 
     The package keeps four of its transfers in flight, so every four cost a round trip.
@@ -101,7 +101,7 @@ class TargetWriter:
         self._device = device
         self._properties = properties
         self._written: list[float] | None = None
-        self._batches: dict[tuple[int, ...], EndpointBatch] = {}
+        self._batches: dict[tuple[int, ...], _EndpointBatch] = {}
 
     def forget(self) -> None:
         """Write everything the next time: the drive's present values are not known."""
@@ -121,7 +121,7 @@ class TargetWriter:
         batch = self._batches.get(new)
         if batch is None:
             properties = [self._properties[index] for index in new]
-            batch = self._batches[new] = EndpointBatch(self._device, properties)
+            batch = self._batches[new] = _EndpointBatch(self._device, properties)
         self._written = None  # if it fails, nobody knows what came through
         await batch.write([values[index] for index in new])
         for index in new:
@@ -172,29 +172,31 @@ class OdriveV3:
             *self._both(("encoder.pos_estimate",)),
             *self._both(("encoder.vel_estimate",)),
         ]
-        self.sample = EndpointBatch(device, estimates)
-        self.sample_and_state = EndpointBatch(device, [*estimates, *self._both(("current_state",))])
-        self.errors = EndpointBatch(
+        self.sample = _EndpointBatch(device, estimates)
+        self.sample_and_state = _EndpointBatch(
+            device, [*estimates, *self._both(("current_state",))]
+        )
+        self.errors = _EndpointBatch(
             device,
             self._both(("error", "motor.error", "encoder.error", "controller.error")),
         )
-        self._currents = EndpointBatch(device, self._both(("motor.current_control.Iq_setpoint",)))
+        self._currents = _EndpointBatch(device, self._both(("motor.current_control.Iq_setpoint",)))
         inputs = ("controller.input_pos", "controller.input_torque")
         gains = ("controller.config.pos_gain", "controller.config.vel_gain")
         self.target = TargetWriter(device, [*self._both(inputs), *self._both(gains)])
-        self._watchdogs = EndpointBatch(device, self._both(("config.enable_watchdog",)))
-        self._counts_per_turn = EndpointBatch(device, self._both(("encoder.config.cpr",)))
+        self._watchdogs = _EndpointBatch(device, self._both(("config.enable_watchdog",)))
+        self._counts_per_turn = _EndpointBatch(device, self._both(("encoder.config.cpr",)))
         self._food: list[Any] = []
         # not in the tree of firmware before 0.5.2, which has it at the motor
-        self._directions: EndpointBatch | None = None
+        self._directions: _EndpointBatch | None = None
         if all(f"{axis}.{_DIRECTION}" in device.properties for axis in _AXES):
-            self._directions = EndpointBatch(device, self._both((_DIRECTION,)))
+            self._directions = _EndpointBatch(device, self._both((_DIRECTION,)))
         self._signs = (1, 1)
-        self._counts = EndpointBatch(device, self._both(_COUNTS))
+        self._counts = _EndpointBatch(device, self._both(_COUNTS))
         # not in the tree of firmware before 0.5.2 either
-        self._heat: EndpointBatch | None = None
+        self._heat: _EndpointBatch | None = None
         if all(f"{axis}.{name}" in device.properties for axis in _AXES for name in _THERMISTORS):
-            self._heat = EndpointBatch(device, self._both(_THERMISTORS))
+            self._heat = _EndpointBatch(device, self._both(_THERMISTORS))
 
     async def look(self) -> None:
         """Read saved settings: watchdogs, and the direction of the currents."""
@@ -268,7 +270,7 @@ class OdriveV3:
 
     async def _write_both(self, names: tuple[str, ...], values: tuple[float, ...]) -> None:
         """Write the same values to both axes, axis0 first."""
-        await EndpointBatch(self.device, self._both(names)).write([*values, *values])
+        await _EndpointBatch(self.device, self._both(names)).write([*values, *values])
 
     def _both(self, names: tuple[str, ...]) -> list[Any]:
         """Return properties of axis0, then the same of axis1."""

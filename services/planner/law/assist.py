@@ -109,7 +109,14 @@ class AssistLaw:
         self._integral_max, self._integral_s = config.integral_max, config.integral_s
 
     def advance(
-        self, s: AssistState, wanted: float, measured: float | None, dt: float, *, still: bool
+        self,
+        s: AssistState,
+        wanted: float,
+        measured: float | None,
+        dt: float,
+        *,
+        still: bool,
+        shed_rate: float = 0.0,
     ) -> float:
         """Advance by one tick; return the rate of the assist in N/s.
 
@@ -119,14 +126,15 @@ class AssistLaw:
             measured: the same force measured at the harness, N; None if not known now.
             dt: time since the last tick, s.
             still: False while the robot holds or the operator leads.
+            shed_rate: N/s with which it may fall, if that is more than `rate_max`.
         """
         wanted = clamp(wanted, 0.0, self._force_max)
         if s.ramp is None:
             # a planner that takes over from HOLD finds the assist in HOLD's feedforward
             s.ramp = wanted
         before = s.ramp + s.integral
-        change_max = self._rate_max * dt
-        s.ramp += clamp(wanted - s.ramp, -change_max, change_max)
+        fall_max = max(self._rate_max, shed_rate) * dt
+        s.ramp += clamp(wanted - s.ramp, -fall_max, self._rate_max * dt)
         steady = still and wanted == s.wanted == s.ramp
         s.wanted = wanted
         s.still_s = s.still_s + dt if steady else 0.0

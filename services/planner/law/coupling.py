@@ -158,7 +158,7 @@ def low_passed(s: CouplingState, tau: Array, bandwidth_hz: float, dt: float) -> 
     return second
 
 
-class LawTerms(NamedTuple):
+class _LawTerms(NamedTuple):
     """One tick's gains, and its coupled torque before any filter."""
 
     body_gains: Callable[[], JointGains]
@@ -177,7 +177,7 @@ class LawAtReference:
         self._gains, self._split = gains, split
         self._uncoupled = UncoupledGains(gains.K_p, gains.B_p, gains.S, split.coupling.damping)
 
-    def evaluate(self, reference: Reference, e_p: Array, e_pdot: Array) -> LawTerms:
+    def evaluate(self, reference: Reference, e_p: Array, e_pdot: Array) -> _LawTerms:
         """Return the terms: docs/law.md (9).
 
         Args:
@@ -195,4 +195,4 @@ class LawAtReference:
         local = self._split.split(body_gains, float(p[2]), float(p[4]), T, reference.hessian_O)
         K_fail = self._split.certificate.failsafe_stiffness(local.D)
         K_c, B_c = self._uncoupled.at(K_fail, (T.T * local.D_B) @ T)
-        return LawTerms(body_gains, local, (K_c @ e_p + B_c @ e_pdot) @ reference.J)
+        return _LawTerms(body_gains, local, (K_c @ e_p + B_c @ e_pdot) @ reference.J)

@@ -84,6 +84,8 @@ class LawInputs(NamedTuple):
     assist: float = 0.0
     """Assist that the operator requests, N. The law limits its rate, except in the first tick,
     which takes over the assist that HOLD carries."""
+    shed_rate: float = 0.0
+    """N/s with which the assist may fall, if that is more than the law's own limit."""
     shift: Vector4 = STRAIGHT
     """Requested x, y (m), roll and yaw (rad) of the shift; limited by the law."""
     toward: Toward = Toward.PERSON
@@ -289,8 +291,9 @@ class Hocca:
         still = not inputs.align and is_still(pdot[2], pdot[4])
         assist_measured = None if force is None else -force
         rate = self._assist.advance(
-            s.assist, inputs.assist, assist_measured, inputs.dt, still=still
-        )
+            s.assist, inputs.assist, assist_measured, inputs.dt,
+            still=still, shed_rate=inputs.shed_rate,
+        )  # fmt: skip
         return force, moment_pitch, rate
 
     def _body_wrench(

@@ -31,13 +31,14 @@ from shared.bus.messages import Mode, Pair, Vector3
 from shared.clock import NS_PER_MS
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.robot.fault_table import FALLEN_REMEDY
+from shared.robot.trip_table import limits_of
 
 AFTER_NS: Final = 150 * NS_PER_MS
 """A robot that is caught in time swings back sooner."""
 MOMENT_NS: Final = 500 * NS_PER_MS
 """From tipping on an edge to the floor it takes 0.5 to 0.8 s."""
-TILT_MAX: Final = 0.4
-"""rad; it stands on 0.12, and hung on a hoist it swings by 0.3."""
+TILT_MAX: Final = 0.5
+"""rad; it stands on 0.12, and hung on a hoist its legs swing by 0.4."""
 WHIRL_MIN: Final = 0.5
 """rad/s"""
 APART_MAX: Final = (0.15, 0.3)
@@ -104,8 +105,9 @@ class FallWatch:
     """Compares the signs with each other."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Take the robot's weight."""
+        """Take the robot's weight; one that never trips, for studies, does not look for falls."""
         self._weight = config.total_mass * GRAVITY
+        self._looks = math.isfinite(limits_of(config).legs.limit)
 
     def advance(self, s: FallState, now_ns: int, modes: Sequence[int], seen: Seen) -> bool:
         """Advance by one tick; return True if a person has just re-armed a robot that had fallen.
@@ -125,7 +127,7 @@ class FallWatch:
             s.whirled_ns = now_ns
         signs = self._signs(s, now_ns, seen, borne)
         agree = len(signs) >= 2 and (seen.up is None or signs[0] in _SURE)
-        if not agree or not any(mode in _STIFF for mode in modes):
+        if not agree or not self._looks or not any(mode in _STIFF for mode in modes):
             s.since_ns = 0
             return False
         s.since_ns = s.since_ns or now_ns

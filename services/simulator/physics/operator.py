@@ -16,7 +16,7 @@ import msgspec
 from services.simulator.physics.plant import Person
 from shared.bus.messages import HandLead, Vector3
 from shared.clamp import clamp
-from shared.config.scenarios import Lead
+from shared.config.scenarios import Act, Lead
 from shared.config.sections import OperatorConfig
 
 BANDWIDTH: Final = 8.0
@@ -144,6 +144,51 @@ class HandForce(NamedTuple):
     """N m about the torso's pitch axis."""
 
 
+class Acting(NamedTuple):
+    """What the person does now beside leading."""
+
+    load: float = 0.0
+    """Weight on the harness that nobody asked for, N."""
+    up: float = 0.0
+    """Force of bumps and tremor, N, up."""
+    ahead: float = 0.0
+    """Force along world x, N."""
+    grip: float = 1.0
+    """Part of its strength with which the hand holds."""
+
+
+NO_ACT: Final = Acting()
+TREMOR_HZ: Final = 6.0
+"""A tremor of effort has 4 to 12 Hz."""
+RELAXED: Final = 0.25
+_GRIPS: Final = {"relax": RELAXED, "limp": 0.0, "let_go": 0.0}
+
+
+def acting(acts: Sequence[Act], t: float) -> Acting:
+    """Return what a person does at scenario time t, s."""
+    load = up = ahead = 0.0
+    grip = 1.0
+    for act in acts:
+        since = t - act.at
+        if not 0.0 <= since < act.duration:
+            continue
+        left = act.duration - since
+        release = act.ramp if act.release is None else act.release
+        share = min(1.0, since / act.ramp if act.ramp > 0.0 else 1.0)
+        share = min(share, left / release if release > 0.0 else 1.0)
+        if act.kind in ("rest", "relax", "limp"):
+            load += share * act.force
+        elif act.kind == "bump":
+            up += act.force * math.sin(math.pi * since / act.duration)
+        elif act.kind == "tremor":
+            up += share * act.force * math.sin(2.0 * math.pi * TREMOR_HZ * since)
+        elif act.kind == "pull":
+            ahead += share * act.force
+        held = _GRIPS.get(act.kind, 1.0)
+        grip = min(grip, held if held == 0.0 else 1.0 + share * (held - 1.0))
+    return Acting(load, up, ahead, grip)
+
+
 REACH_S: Final = 0.4
 """Time constant with which a hand that grips the robot joins the path."""
 
@@ -162,6 +207,8 @@ class Wearer(msgspec.Struct):
     """m/s"""
     load_n: float = 0.0
     """What rests on the harness, N."""
+    asked_n: float = 0.0
+    """The part of it that was asked for."""
     reach: float = 0.0
     """m, the path is so far off still, since it took hold: gone before a scenario starts."""
     holds: bool = False
@@ -175,10 +222,11 @@ class Wearer(msgspec.Struct):
         """Return how far the hand is above its path, m, and its rate, m/s."""
         return self.above + self.reach, self.rate - self.reach / REACH_S
 
-    def step(self, dt: float, force_on_robot: float, assist: float) -> None:
+    def step(self, dt: float, force_on_robot: float, assist: float, load: float = 0.0) -> None:
         """Advance by dt, s, under the hand's force on the robot, N, up.
 
-        Of the assist that it requests, N, the person rests a part, with a delay.
+        Of the assist that it requests, N, the person rests a part, with a delay; a load that it
+        asks nobody for comes on top.
         """
         person = self.person
         if person.mass > 0.0:
@@ -189,7 +237,8 @@ class Wearer(msgspec.Struct):
             self.above += dt * self.rate
         self.reach -= self.reach * dt / REACH_S
         wanted, lag = person.load_scale * assist, person.load_lag_s
-        self.load_n += (wanted - self.load_n) * (min(1.0, dt / lag) if lag > 0.0 else 1.0)
+        self.asked_n += (wanted - self.asked_n) * (min(1.0, dt / lag) if lag > 0.0 else 1.0)
+        self.load_n = self.asked_n + load
 
 
 class Operator:
@@ -212,7 +261,10 @@ class Operator:
         point_height = wanted.height - x * sine + z * cosine
         point_rate = wanted.height_rate - (x * cosine + z * sine) * wanted.pitch_rate
         hand = self._hand
-        force = hand.k_z * (point_height - height) + hand.b_z * (point_rate - rate)
+        spring = hand.k_z * (point_height - height)
+        if hand.soft_n > 0.0:
+            spring /= 1.0 + abs(spring) / hand.soft_n
+        force = spring + hand.b_z * (point_rate - rate)
         moment = hand.k_pitch * (wanted.pitch - pitch) + hand.b_pitch * (
             wanted.pitch_rate - pitch_rate
         )

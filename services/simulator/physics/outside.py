@@ -9,7 +9,14 @@ import msgspec
 import numpy as np
 
 from services.simulator.physics.body import Body
-from services.simulator.physics.operator import HandForce, LedHand, Operator, Wearer
+from services.simulator.physics.operator import (
+    NO_ACT,
+    HandForce,
+    LedHand,
+    Operator,
+    Wearer,
+    acting,
+)
 from shared.arrays import Array
 from shared.bus.messages import Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at
@@ -86,6 +93,7 @@ class OutsideForces:
         holds: the operator's hand is on the harness.
         hand: the hand's force now.
         hand_side: the hand's force along world y, N.
+        hand_ahead: the person's force along world x, N.
         push: the push now, N, world.
         harness_force: the operator's force on the torso at the harness point, N, torso axes.
         harness_moment: N m, torso axes.
@@ -103,7 +111,7 @@ class OutsideForces:
         self.led_hand: LedHand | None = None
         self.holds = scenario.hand
         self.hand = HandForce(0.0, 0.0)
-        self.hand_side = 0.0
+        self.hand_side = self.hand_ahead = 0.0
         self.push: Vector3 = (0.0, 0.0, 0.0)
         self.harness_force: Vector3 = (0.0, 0.0, 0.0)
         self.harness_moment: Vector3 = (0.0, 0.0, 0.0)
@@ -138,7 +146,11 @@ class OutsideForces:
         off_y = r[3] * com_x + r[4] * com_y + r[5] * com_z
         off_z = r[6] * com_x + r[7] * com_y + r[8] * com_z
         self.hand, side = HandForce(0.0, 0.0), 0.0
-        if self.holds and self.hoist.share == 0.0:
+        acts = self.scenario.act
+        now = acting(acts, scenario_s) if acts else NO_ACT
+        if now.grip == 0.0:
+            self.wearer.holds = False
+        elif self.holds and self.hoist.share == 0.0:
             height = float(torso.position[2]) + arm_z
             _, v_y, v_z, w_x, w_y, w_z = torso.rates.tolist()  # omega in torso axes
             omega_x = r[0] * w_x + r[1] * w_y + r[2] * w_z
@@ -148,31 +160,37 @@ class OutsideForces:
             above, rising = self.wearer.motion()
             height, rate = height - above, rate - rising
             self.hand = self.operator.force(wanted, height, rate, math.atan2(-r[6], r[8]), w_y)
+            if acts:
+                force_z, moment = self.hand
+                self.hand = HandForce(now.grip * force_z, now.grip * moment)
             if wanted.side is not None:
                 omega_z = r[6] * w_x + r[7] * w_y + r[8] * w_z
                 across = v_y + omega_z * arm_x - omega_x * arm_z
                 at = float(torso.position[1]) + arm_y
                 side = self.operator.force_side(wanted, at, across)
-        self.wearer.step(dt, self.hand.force_z, wanted.assist)
+        if acts:
+            self.hand = HandForce(self.hand.force_z + now.up, self.hand.moment_pitch)
+        self.wearer.step(dt, self.hand.force_z, wanted.assist, now.load)
         self.push = push_at(self.scenario, scenario_s) if scenario_s >= 0.0 else (0.0, 0.0, 0.0)
         if led_hand is not None:
             self.push = led_hand.push or self.push
         f, m = self.hand.force_z - self.wearer.load_n, self.hand.moment_pitch
-        self.hand_side = side
-        # in torso axes, as the sensor feels it: side along world y, f along z, m about torso y
+        ahead = now.ahead
+        self.hand_side, self.hand_ahead = side, ahead
+        # in torso axes, as the sensor feels it, and m about torso y
         self.harness_force = (
-            r[3] * side + r[6] * f,
-            r[4] * side + r[7] * f,
-            r[5] * side + r[8] * f,
+            r[0] * ahead + r[3] * side + r[6] * f,
+            r[1] * ahead + r[4] * side + r[7] * f,
+            r[2] * ahead + r[5] * side + r[8] * f,
         )
         self.harness_moment = (0.0, m, 0.0)
         torso.wrench[:] = (
-            self.push[0],
+            self.push[0] + ahead,
             self.push[1] + side,
             self.push[2] + f,
             r[1] * m + (arm_y - off_y) * f - (arm_z - off_z) * side,
-            r[4] * m - (arm_x - off_x) * f,
-            r[7] * m + (arm_x - off_x) * side,
+            r[4] * m - (arm_x - off_x) * f + (arm_z - off_z) * ahead,
+            r[7] * m + (arm_x - off_x) * side - (arm_y - off_y) * ahead,
         )
         if self.hoist.share > 0.0:
             torso.wrench[:] += self.hoist.advance(torso, dt)

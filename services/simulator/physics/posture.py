@@ -28,7 +28,7 @@ LEAST_N: Final = 1e-3
 """A sole that bears less has no centre of pressure."""
 
 
-class MeasuredPosture(NamedTuple):
+class _MeasuredPosture(NamedTuple):
     """Posture of the robot, world axes."""
 
     com: Vector3
@@ -65,14 +65,14 @@ class SoleLoad(NamedTuple):
     """Centre of pressure, x and y, m, world; (0, 0) if it bears nothing."""
 
 
-def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -> MeasuredPosture:
+def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -> _MeasuredPosture:
     """Return the posture after a step; `ankles` (2, 3), m, is where the feet were placed."""
     rotation = data.xmat[torso].reshape(3, 3)
     roll = math.asin(clamp(rotation[2, 1], -1.0, 1.0))
     pitch = math.atan2(-rotation[2, 0], rotation[2, 2])
     yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
     moved = np.array([data.xpos[foot] for foot in feet]) - ankles
-    return MeasuredPosture(
+    return _MeasuredPosture(
         com=as_vector(data.subtree_com[0]),
         torso=as_vector(data.xpos[torso]),
         angles=(roll, pitch, yaw),

@@ -118,7 +118,8 @@ class World:
     def hidden(self) -> tuple[float, ...]:
         """Return what MuJoCo does not hold: the person, the drivetrain, torques on their way."""
         wearer = self.outside.wearer
-        return (wearer.above, wearer.rate, wearer.load_n, *self.actuation.numbers())
+        person = wearer.above, wearer.rate, wearer.asked_n, wearer.reach
+        return (*person, *self.actuation.numbers())
 
     def resume(self, state: SimState) -> None:
         """Continue from the state of another world of the same robot, plant and scenario."""
@@ -131,9 +132,9 @@ class World:
             self._start_time = self.time - state.scenario_s
         outside.hoist.share, outside.hoist.releasing = state.hoist, state.hoist < 1.0
         wearer, numbers = outside.wearer, state.hidden
-        wearer.above, wearer.rate, wearer.load_n = numbers[:3]
+        wearer.above, wearer.rate, wearer.asked_n, wearer.reach = numbers[:4]
         wearer.holds = True
-        self.actuation.set_numbers(numbers[3:])
+        self.actuation.set_numbers(numbers[4:])
         outside.led_hand = LedHand.of_numbers(state.hand) if any(state.hand) else None
 
     # ---- the scenario, the operator, the hoist
@@ -237,7 +238,7 @@ class World:
             com=posture.com,
             torso=posture.torso,
             angles=posture.angles,
-            operator_force=(0.0, outside.hand_side, outside.hand.force_z),
+            operator_force=(outside.hand_ahead, outside.hand_side, outside.hand.force_z),
             operator_moment=as_vector(moment),
             load_n=outside.wearer.load_n,
             harness_force_z=outside.wearer.load_n - outside.hand.force_z,

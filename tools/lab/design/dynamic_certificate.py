@@ -124,7 +124,7 @@ class Condition(NamedTuple):
         return f"{HALF_NAMES[self.half]}: " + ", ".join(parts)
 
 
-class DynamicVerdict(NamedTuple):
+class _DynamicVerdict(NamedTuple):
     """The worst case found."""
 
     growth: Growth
@@ -252,9 +252,9 @@ class DynamicCertificate:
         modes: Sequence[str] = TRACK + HELD + BLIND,
         *,
         stop_above: float = np.inf,
-    ) -> DynamicVerdict:
+    ) -> _DynamicVerdict:
         """Return the condition with the slowest decay, or the first excess above so much, 1/s."""
-        worst: DynamicVerdict | None = None
+        worst: _DynamicVerdict | None = None
         for condition in self.conditions(modes):
             verdict = self.judge(condition, design)
             if worst is None or verdict.excess > worst.excess:
@@ -277,14 +277,14 @@ class DynamicCertificate:
                  and c.delay_s <= self._wanted.delay_ms / 1e3)  # fmt: skip
         return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
 
-    def judge(self, condition: Condition, design: Design) -> DynamicVerdict:
+    def judge(self, condition: Condition, design: Design) -> _DynamicVerdict:
         """Return the growth of the loop in a condition, and its excess."""
         growth = self.loop(condition, design).growth(condition.gains)
         drifts = condition.half == 0 and growth.frequency_hz < DRIFT_HZ
         allowed = self._wanted.drift_max if drifts and condition.mode == "TRACK" else 0.0
         if condition.mode in BLIND:
             allowed = math.log(BLIND_GROWTH_MAX) / BLIND_S
-        return DynamicVerdict(growth, condition, growth.rate - allowed)
+        return _DynamicVerdict(growth, condition, growth.rate - allowed)
 
     def _in_track(self, node: StiffnessNode, stiffness: float, half: int) -> Iterator[Condition]:
         wanted = self._wanted

@@ -49,7 +49,7 @@ _SLOPE_MIN: Final = 1e-12
 _LEGS: Final = (slice(0, N_LEG), slice(N_LEG, N_JOINTS))
 
 
-class PushLimit(NamedTuple):
+class _PushLimit(NamedTuple):
     """The hardest push along one direction."""
 
     force_n: float
@@ -61,13 +61,13 @@ class PushLimit(NamedTuple):
 class PushLimits(NamedTuple):
     """The hardest constant push along one direction, for each set of active controllers."""
 
-    led: PushLimit
+    led: _PushLimit
     """TRACK: joint services and planner; a push that has grown slowly."""
-    held: PushLimit
+    held: _PushLimit
     """HOLD: joint services only, the planner is dead."""
-    drives: PushLimit
+    drives: _PushLimit
     """Drives only, the joint services are dead as well."""
-    body: PushLimit
+    body: _PushLimit
     """Limit of soles and motors under any control."""
 
 
@@ -172,14 +172,14 @@ class LoadedStand:
 
     def limit_held(
         self, D: Array, direction: tuple[float, float], K_c: Array | None = None
-    ) -> PushLimit:
+    ) -> _PushLimit:
         """Return the hardest constant push that the gains hold; arguments as for `response`."""
         response = self.response(D, direction, K_c)
         return self._hardest(response, np.zeros(2 * N_JOINTS))
 
     def limit_led(
         self, D: Array, direction: tuple[float, float], K_c: Array, integral_max: float
-    ) -> PushLimit:
+    ) -> _PushLimit:
         """Return the hardest push that gains and integral hold, which grew slowly.
 
         Arguments as for `response`; `integral_max` is of F_I, N; 0: there is none
@@ -198,21 +198,21 @@ class LoadedStand:
         beyond = self._hardest(self.response(D, direction, K_c), borne)
         return beyond._replace(force_n=until_n + beyond.force_n)
 
-    def _hardest(self, response: Response | None, borne: Array) -> PushLimit:
+    def _hardest(self, response: Response | None, borne: Array) -> _PushLimit:
         """Return the hardest push on top of what torques and soles (24,) bear already."""
         if response is None:
-            return PushLimit(0.0, "the stiffness")
+            return _PushLimit(0.0, "the stiffness")
         before = borne + np.concatenate((self._tau, self._soles(self._W)))
         per_newton = np.concatenate((response.dtau, response.soles))
-        hardest = PushLimit(math.inf, "nothing")
+        hardest = _PushLimit(math.inf, "nothing")
         for part, row, bound in self._limits:
             slope = float(row @ per_newton)
             if slope > _SLOPE_MIN:
                 force = max(0.0, (bound - float(row @ before)) / slope)
-                hardest = min(hardest, PushLimit(force, part))
+                hardest = min(hardest, _PushLimit(force, part))
         return hardest
 
-    def limit_of_body(self, direction: Sequence[float], limp: str = "") -> PushLimit:
+    def limit_of_body(self, direction: Sequence[float], limp: str = "") -> _PushLimit:
         """Return the hardest push that soles and motors bear at this pose under any control.
 
         The direction is world x and y, a unit vector; or a wrench on the torso (6,), N and N m: the
@@ -237,10 +237,10 @@ class LoadedStand:
             bounds=[(None, None)] * 6 + [(0.0, None)],
         )
         if not solution.success:
-            return PushLimit(0.0, "the pose itself")
+            return _PushLimit(0.0, "the pose itself")
         left = np.where(limp_rows, np.inf, bounds - rows @ slopes @ solution.x)
         tightest = int(np.argmin(left))
-        return PushLimit(float(solution.x[6]), self._limits[tightest].part)
+        return _PushLimit(float(solution.x[6]), self._limits[tightest].part)
 
     def _joint_torques(self, W: list[Array]) -> Array:
         """Return the joint torques (12,), N m, that carry the torso's wrench on each leg."""

@@ -26,7 +26,7 @@ SHOWN: Final = 60
 """Characters of a value."""
 
 
-class Difference(msgspec.Struct, frozen=True):
+class _Difference(msgspec.Struct, frozen=True):
     """One value that came out otherwise."""
 
     t_ns: int
@@ -68,8 +68,8 @@ class Comparison:
         self._tolerance = tolerance
         self.compared = 0
         self.differing = 0
-        self.first: Difference | None = None
-        self.largest: dict[tuple[str, str], Difference] = {}
+        self.first: _Difference | None = None
+        self.largest: dict[tuple[str, str], _Difference] = {}
 
     def take(self, key: str, tick: int, recorded: Message, recomputed: Message) -> bool:
         """Compare two messages; return True if they agree."""
@@ -78,7 +78,7 @@ class Comparison:
             return True
         pairs = _walk("", msgspec.to_builtins(recorded), msgspec.to_builtins(recomputed))
         rows = [
-            Difference(recorded.t_ns, tick, key, field, a, b)
+            _Difference(recorded.t_ns, tick, key, field, a, b)
             for field, a, b in pairs
             if not _near(a, b, self._tolerance)
         ]
@@ -96,7 +96,7 @@ class Comparison:
         self.first = self.first or later.first
         self._keep_largest(later.largest.values())
 
-    def _keep_largest(self, rows: Iterable[Difference]) -> None:
+    def _keep_largest(self, rows: Iterable[_Difference]) -> None:
         for row in rows:
             before = self.largest.get((row.key, row.field))
             if before is None or size(row) > size(before):
@@ -160,7 +160,7 @@ def memory_of(text: str, kind: type[State]) -> State:
         ) from None
 
 
-def size(row: Difference) -> float:
+def size(row: _Difference) -> float:
     """Return how far apart the two values are; infinite where they are no numbers."""
     a, b = row.recorded, row.recomputed
     return abs(b - a) if _is_number(a) and _is_number(b) else math.inf

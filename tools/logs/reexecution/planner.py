@@ -183,6 +183,7 @@ class PlannerExecution:
             shift=status.shift_requested,
             source=status.requested_by,
             sit=status.sit,
+            park=status.park_requested,
         )
         return given
 

@@ -97,7 +97,7 @@ def entries(index: RunIndex, part: RunPart, keys: Collection[str]) -> Iterator[E
                 yield Entry(log_ns - begin_ns, key, record.body[start:end])
 
 
-class Port(Protocol):
+class _Port(Protocol):
     """The way to one key of the bus."""
 
     def put(self, payload: bytes) -> bool:
@@ -136,7 +136,7 @@ class Played(msgspec.Struct):
 
 def pace(
     entries: Iterable[Entry],
-    ports: Mapping[str, Port],
+    ports: Mapping[str, _Port],
     rate: float,
     played: Played,
     *,

@@ -71,7 +71,7 @@ def run(flags: CheckFlags) -> int:
     return 0 if all(row.good for row in rows) else FAULT_EXIT_CODE
 
 
-class CheckRow(NamedTuple):
+class _CheckRow(NamedTuple):
     """One finding."""
 
     good: bool
@@ -81,36 +81,36 @@ class CheckRow(NamedTuple):
     """What to do if it is not good."""
 
 
-def look(robot: RobotConfig, domain: int, wait_s: float) -> list[CheckRow]:
+def look(robot: RobotConfig, domain: int, wait_s: float) -> list[_CheckRow]:
     """Look at the network as a node of it."""
     ros2, types = robot.ros2, RosTypes(robot.ros2.distribution)
     ros = _opened(ros2.router, domain, types, wait_s)
     if ros is None:
         fix = "start it where ROS 2 is: ros2 run rmw_zenoh_cpp rmw_zenohd; or correct ros2.router"
-        return [CheckRow(False, f"router {ros2.router}", "does not answer", fix)]
+        return [_CheckRow(False, f"router {ros2.router}", "does not answer", fix)]
     with ros:
-        rows = [CheckRow(True, f"router {ros2.router}", "answers")]
+        rows = [_CheckRow(True, f"router {ros2.router}", "answers")]
         name = f"/{ros2.namespace}/{NODE}" if ros2.namespace else f"/{NODE}"
         deadline = time.monotonic() + wait_s
         while name not in (nodes := _nodes(seen := ros.graph())):
             if time.monotonic() > deadline:
                 found = f"not among: {', '.join(nodes) or 'none'}"
                 fix = f"start it: xrl up --ros2 --domain {domain}; it may be in another domain"
-                return [*rows, CheckRow(False, f"node {name}", found, fix)]
+                return [*rows, _CheckRow(False, f"node {name}", found, fix)]
             time.sleep(LOOK_S)
-        rows.append(CheckRow(True, f"node {name}", "in the graph"))
+        rows.append(_CheckRow(True, f"node {name}", "in the graph"))
         known = topics_of(ros2.namespace)
         own = {(one.topic, one.type_hash) for one in seen if one.kind == "MP" and one.node == name}
         shown = [topic for topic in known if (topic.name, types.hash(topic.type)) in own]
         rows += [
-            CheckRow(True, topic.name, topic.type) if topic in shown else _missing(topic, seen)
+            _CheckRow(True, topic.name, topic.type) if topic in shown else _missing(topic, seen)
             for topic in known
             if _has_rate(topic, known, robot)
         ]
         steady = [topic for topic in shown if topic != known.description]
         rows += _received(ros, steady, known, max(wait_s, 3.0 / (ros2.diagnostics_hz or 1.0)))
         others = [node for node in nodes if node != name]
-        return [*rows, CheckRow(True, "other nodes", ", ".join(others) or "none")]
+        return [*rows, _CheckRow(True, "other nodes", ", ".join(others) or "none")]
 
 
 def _opened(router: str, domain: int, types: RosTypes, wait_s: float) -> RosSession | None:
@@ -135,16 +135,16 @@ def _has_rate(topic: RosTopic, known: RosTopics, robot: RobotConfig) -> bool:
     return rates.get(topic, 1.0) > 0.0
 
 
-def _missing(topic: RosTopic, seen: list[SeenEndpoint]) -> CheckRow:
+def _missing(topic: RosTopic, seen: list[SeenEndpoint]) -> _CheckRow:
     others = [one for one in seen if one.kind == "MP" and one.topic == topic.name]
     found = f"with another type, {others[0].type}" if others else "not in the graph"
     fix = "the same distribution on both sides: ros2.distribution"
-    return CheckRow(False, topic.name, found, fix)
+    return _CheckRow(False, topic.name, found, fix)
 
 
 def _received(
     ros: RosSession, topics: list[RosTopic], known: RosTopics, wait_s: float
-) -> list[CheckRow]:
+) -> list[_CheckRow]:
     """Count what arrives, and wait up to `wait_s` for a slow topic's first message."""
     ros.subscribe(topics)
     counts = dict.fromkeys(topics, 0)
@@ -165,7 +165,7 @@ def _received(
             found += f", {len(joints)} of {len(JOINTS)} joints"
         good = count > 0 and (topic != known.joint_states or len(joints) == len(JOINTS))
         fix = "the gateway or a service is silent: xrl status"
-        rows.append(CheckRow(good or topic == known.wrench, f"{topic.name}, received", found, fix))
+        rows.append(_CheckRow(good or topic == known.wrench, f"{topic.name}, received", found, fix))
     return rows
 
 

@@ -354,7 +354,7 @@ def trial_of(grid: Sequence[tuple[Network, str]], seed: int, number: int) -> Lat
     return LatencyTrial(number=number, repeat=repeat, seed=seed, control=control, network=network)
 
 
-class Cell(NamedTuple):
+class _Cell(NamedTuple):
     """Trials of one control at one delay."""
 
     fallen: int
@@ -375,7 +375,7 @@ class Cell(NamedTuple):
         )
 
 
-def cells_of(rows: Sequence[Row]) -> dict[tuple[str, float], Cell]:
+def cells_of(rows: Sequence[Row]) -> dict[tuple[str, float], _Cell]:
     """Return the trials by control and delay, in the order of `CONTROLS`."""
     cells = {}
     delays = sorted({float(row["delay_ms"]) for row in rows})
@@ -387,7 +387,7 @@ def cells_of(rows: Sequence[Row]) -> dict[tuple[str, float], Cell]:
                 median([row[column] for row in known]) if known else math.nan
                 for column in ("operator_peak_n", "hold_share")
             )
-            cells[control, delay] = Cell(len(parted(own)[1]), len(own), peak, held)
+            cells[control, delay] = _Cell(len(parted(own)[1]), len(own), peak, held)
     return cells
 
 

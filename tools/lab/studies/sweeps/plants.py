@@ -29,7 +29,7 @@ SHARE: Final = 0.75
 SHARE_MAX: Final = 3.0
 
 
-class ErrorRange(Section, frozen=True):
+class _ErrorRange(Section, frozen=True):
     """One error of the plant."""
 
     key: str
@@ -42,7 +42,7 @@ class ErrorRange(Section, frozen=True):
 class Ranges(Section, frozen=True):
     """The whole file."""
 
-    error: tuple[ErrorRange, ...]
+    error: tuple[_ErrorRange, ...]
 
 
 @cache
@@ -91,7 +91,7 @@ def errors_of(plant: PlantConfig) -> dict[str, float]:
     return found
 
 
-def _drawn(dice: random.Random, row: ErrorRange, beyond: float) -> float:
+def _drawn(dice: random.Random, row: _ErrorRange, beyond: float) -> float:
     logarithmic = row.scale == "log"
     low, high = (math.log(row.low), math.log(row.high)) if logarithmic else (row.low, row.high)
     middle, half = 0.5 * (low + high), 0.5 * (high - low) * beyond
