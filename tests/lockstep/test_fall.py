@@ -38,8 +38,6 @@ class Watched(NamedTuple):
     late_s: float | None
     """From the moment at which the simulator calls it fallen to the planner's; None: it stood."""
     found: bool
-    torque: float
-    """Largest of all joints from 0.8 s after the fall on, N m."""
 
 
 def watched(
@@ -50,19 +48,17 @@ def watched(
 ) -> Watched:
     """Run a scenario to its end, or for a while beyond a fall."""
     fleet = Lockstep(robot, scenario, plant=plant)
-    fell_ns, torque = 0, 0.0
+    fell_ns = 0
     for row in fleet.run():
         nudge(fleet, row)
         fell_ns = fell_ns or (row.t_ns if row.fallen else 0)
         since_s = (row.t_ns - fell_ns) / NS_PER_S if fell_ns else 0.0
-        if since_s > 0.8:
-            torque = max(torque, *(abs(tau) for each in fleet.controllers for tau in each.tau))
         if since_s > AFTER_S:
             break
     assert fleet.planner is not None
     found_ns = fleet.planner.state.fall.fell_ns
     late_s = (found_ns - fell_ns) / NS_PER_S if fell_ns and found_ns else None
-    return Watched(fleet, math.inf if fell_ns and not found_ns else late_s, found_ns > 0, torque)
+    return Watched(fleet, math.inf if fell_ns and not found_ns else late_s, found_ns > 0)
 
 
 def shove(number: int) -> tuple[Scenario, PlantConfig]:
@@ -82,7 +78,7 @@ def shove(number: int) -> tuple[Scenario, PlantConfig]:
     return scenario, plants.draw(f"fall {number}")
 
 
-@pytest.mark.sampled(20)
+@pytest.mark.sampled(50)
 @pytest.mark.parametrize("number", range(100))
 def test_with_an_imu_every_fall_is_found_within_0_3_s_and_all_let_go(number: int) -> None:
     """Before, a module pressed on the floor with 116 N m, and some robots led again as they lay."""
@@ -97,11 +93,6 @@ def test_with_an_imu_every_fall_is_found_within_0_3_s_and_all_let_go(number: int
     status = status_of(run.fleet)
     assert "it has fallen" in status.why
     assert "xrl rearm" in status.why
-
-
-@pytest.mark.parametrize("number", [2, 9, 16])
-def test_a_fallen_robot_presses_on_nothing_for_long(number: int) -> None:
-    assert watched(WITH_IMU, *shove(number)).torque < 60.0
 
 
 def lifted(number: int) -> tuple[Scenario, PlantConfig, Nudge]:
@@ -136,14 +127,14 @@ def lifted(number: int) -> tuple[Scenario, PlantConfig, Nudge]:
     return scenario, plants.draw(f"hoist {number}"), nudge
 
 
-@pytest.mark.sampled(50)
+@pytest.mark.sampled(100)
 @pytest.mark.parametrize("number", range(100))
 def test_a_robot_on_a_hoist_that_swings_has_not_fallen(number: int) -> None:
     scenario, plant, nudge = lifted(number)
     assert not watched(WITH_IMU, scenario, plant, nudge).found
 
 
-@pytest.mark.sampled(50)
+@pytest.mark.sampled(100)
 @pytest.mark.parametrize("number", range(200))
 def test_led_leaned_on_shoved_and_killed_what_stands_has_not_fallen(number: int) -> None:
     """Every third one on a slope of up to ten degrees, on which it may not even be led."""
@@ -153,13 +144,14 @@ def test_led_leaned_on_shoved_and_killed_what_stands_has_not_fallen(number: int)
     assert run.late_s is not None or not run.found
 
 
-def test_a_robot_that_lies_is_not_led_when_it_is_rearmed() -> None:
+def test_a_robot_that_lies_presses_on_nothing_and_is_not_led_when_it_is_rearmed() -> None:
     scenario, plant = shove(4)
     fleet = Lockstep(WITH_IMU, scenario, plant=plant)
     rows = fleet.run()
     fell_s = next(row.scenario_s for row in rows if row.fallen)
     next(row for row in rows if row.scenario_s > fell_s + AFTER_S)
     assert set(modes_of(fleet)) == {Mode.DAMP}
+    assert max(abs(tau) for each in fleet.controllers for tau in each.tau) < 30.0
     for joint in fleet.joints:
         joint.kill(for_good=True)
         joint.restart()

@@ -175,8 +175,9 @@ def test_a_killed_and_restarted_planner_is_survived_and_recorded(
         assert stood(run.code, run.out), run.said
         assert "STOOD" in run.said
         assert set(run.summary["handover_ms"]) == set(MODULES)
-        assert all(value is not None for value in run.summary["handover_ms"].values())
         assert run.summary["reengage_s"] is not None
+    for run, _ in compared.pairs:  # after a stall, a module may hold already when it is killed
+        assert all(value is not None for value in run.summary["handover_ms"].values())
     out = begun[-1].out
     assert begun[-1].summary.keys() >= SUMMARY_KEYS
     assert (out / "run.png").stat().st_size > 20_000

@@ -19,7 +19,14 @@ from shared.places import refuse_shipped
 from tools.flags import Arg, ConfigFlags, option
 from tools.lab.design import split_program
 from tools.lab.design.body_stiffness import BodyStiffness, for_robot
-from tools.lab.design.dynamic_certificate import BLIND, BLIND_S, HELD, TRACK, DynamicCertificate
+from tools.lab.design.dynamic_certificate import (
+    BLIND,
+    BLIND_S,
+    HELD,
+    PARKED,
+    TRACK,
+    DynamicCertificate,
+)
 from tools.terminal import Console
 
 ROOM_EVERY = 5
@@ -133,6 +140,8 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     certificate, design = DynamicCertificate(robot, nodes), split_program.design_of(schedule)
     worst = certificate.worst(design, TRACK + HELD)
     console.print(f"least stable of the required conditions: {worst.words()}", soft_wrap=True)
+    parked = certificate.worst(design, PARKED)
+    console.print(f"least stable while parked: {parked.words()}", soft_wrap=True)
     fades = certificate.sway(design)
     console.print(f"slowest oscillation while led fades with {-fades:.2f}/s")
     blind = certificate.worst(design, BLIND).growth.rate

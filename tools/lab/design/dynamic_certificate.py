@@ -7,7 +7,8 @@ robot file:
 
 - with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
 - with the delay scaled by `delay_margin`, also while F_I is at its limit;
-- in HOLD with the services, and with the drives alone.
+- in HOLD with the services, and with the drives alone;
+- on request, parked: as in TRACK, but height and pitch are closed, and nothing may drift.
 
 While an encoder is blind, which its drive says only after `BLIND_S`, a motion may grow, by
 `BLIND_GROWTH_MAX` at most until then.
@@ -54,6 +55,7 @@ DRIFT_HZ: Final = 0.05
 """A slower motion is no oscillation but a drift: the leading operator is part of that loop."""
 HALF_NAMES: Final = ("fore and aft", "sideways", "all directions")
 TRACK: Final = ("TRACK",)
+PARKED: Final = ("parked",)
 HELD: Final = ("HOLD", "drives alone")
 """Modes: with the services, and with the drives alone."""
 BLIND: Final = tuple(
@@ -223,8 +225,10 @@ class DynamicCertificate:
         """Return the loop of a condition."""
         c = condition
         stand, half = c.node.stand, self._halves[c.half]
-        if c.mode == "TRACK":
+        if c.mode in TRACK + PARKED:
             feedback = self.feedback(c.node, design)
+            if c.mode in PARKED:  # the hand leads nothing, so nothing is eased
+                stand, feedback = stand._replace(S=np.zeros(6)), feedback._replace(lead_easing=0.0)
             if not c.integral:
                 feedback = feedback._replace(integral_gain=0.0)
         else:
@@ -237,7 +241,9 @@ class DynamicCertificate:
 
     def conditions(self, modes: Sequence[str] = TRACK + HELD + BLIND) -> Iterator[Condition]:
         """Yield every condition."""
-        for cases_of, own in ((self._in_track, TRACK), (self._in_hold, HELD)):
+        for cases_of, own in (
+            (self._in_track, TRACK), (self._in_park, PARKED), (self._in_hold, HELD),
+        ):  # fmt: skip
             if not set(own) <= set(modes):
                 continue
             for case in itertools.product(self._nodes, self._wanted.stiffness, (0, 1)):
@@ -300,6 +306,10 @@ class DynamicCertificate:
             yield case._replace(delay_s=delay, gains=Gains(coupling=wanted.gain_margin))
             yield case._replace(gains=Gains(torque=wanted.gain_margin))
             yield case._replace(delay_s=delay, gains=Gains(torque=wanted.gain_margin))
+
+    def _in_park(self, node: StiffnessNode, stiffness: float, half: int) -> Iterator[Condition]:
+        for case in self._in_track(node, stiffness, half):
+            yield case._replace(mode=PARKED[0])
 
     def _in_hold(self, node: StiffnessNode, stiffness: float, half: int) -> Iterator[Condition]:
         for mode in HELD:

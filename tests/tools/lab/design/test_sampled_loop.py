@@ -20,6 +20,7 @@ from tests.lockstep.runs import still
 from tests.tools.lab.design import loop_oracle
 from tools.lab.design.dynamic_certificate import (
     BLIND,
+    PARKED,
     Condition,
     Design,
     DynamicCertificate,
@@ -292,3 +293,10 @@ def test_until_its_drive_says_so_a_blind_encoder_lets_motions_grow_by_half_at_mo
     verdict = DynamicCertificate(robot, heavy).worst(design, BLIND)
     assert not verdict.stable
     assert verdict.condition.mode in BLIND
+
+
+def test_parked_with_height_and_pitch_closed_every_motion_decays(
+    certificate: DynamicCertificate, design: Design
+) -> None:
+    """With the margins that are required of a led robot, and with no drift allowed."""
+    assert certificate.worst(design, PARKED).stable
