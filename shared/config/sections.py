@@ -193,7 +193,7 @@ class ParkConfig(Section, frozen=True):
     """Net pull up that opens it; the peak of a led squat."""
     open_back_nm: Annotated[float, Range(2.0, 50.0, "N m")] = 6.0
     """Moment backwards that opens it."""
-    still_s: Annotated[float, Range(0.1, 5.0, "s")] = 0.35
+    still_s: Annotated[float, Range(0.1, 5.0, "s")] = 1.0
     """Time for which it must be still before it parks."""
 
 
