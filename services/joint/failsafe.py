@@ -119,7 +119,7 @@ def timing_of(config: RobotConfig) -> Timing:
 
 
 FALLEN_NS: Final = 50 * NS_PER_MS
-"""How long a planner must say that the robot has fallen; one wrong command is no fall."""
+"""How long a planner must report a fall before a module acts: one wrong command is not enough."""
 RETIRED_SESSIONS_KEPT: Final = 256
 """Planners that a module remembers; after more restarts the first of them could come back."""
 TAU_ACCEPTED_MAX: Final = 4.0

@@ -517,7 +517,7 @@ class PlannerStatus(Message, frozen=True):
     """Place of the right foot relative to the left, as deviation from the robot file: x, y, z, m,
     and a rotation vector, rad, world axes."""
     why: str = ""
-    """Why it does not lead, where the mode does not say it all; first what ails the supply."""
+    """Why it does not lead, where the mode does not say it all; a supply's fault comes first."""
     trip: Int64 = 0
     """Trip for which it does not lead."""
     load: Vector3 = (0.0, 0.0, 0.0)

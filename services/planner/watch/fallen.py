@@ -48,9 +48,9 @@ ROLL_YAW_MAX: Final = (0.3, 0.5)
 PITCH: Final = (-0.45, 1.6)
 """rad; led are -0.1 to 1.2."""
 TIPPING: Final = 0.75
-"""Of half the sole; 1 is its edge. The torques of a sole that tips are behind it."""
+"""Of half the sole; 1 is its edge, but measured torques lag as a sole tips."""
 BORNE: Final = 0.8
-"""Of the weight: with less on its soles, a hoist pulls the robot over an edge as it lifts it."""
+"""Of the weight: a hoist that lifts the robot tips it over an edge too, but unloads it first."""
 UNLOADED: Final = 0.45
 """Of the weight."""
 

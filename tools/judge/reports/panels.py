@@ -37,7 +37,7 @@ COLOURS: Final[Mapping[str, str]] = {
     "DISARMED": "idle", "HOLD": "warn", "TRACK": "good", "DAMP": "odd", "FAULT": "bad",
     "WAITING": "idle", "ALIGNING": "warn", "LEADING": "good", "OVERLOADED": "odd",
     "UNCERTIFIED": "bad", "MISPLACED": "bad", "TRIPPED": "bad", "MISLOADED": "bad",
-    "YIELDING": "odd", "IMPAIRED": "net", "CUT": "bad",
+    "YIELDING": "odd", "FALLEN": "bad", "IMPAIRED": "net", "CUT": "bad",
 }  # fmt: skip
 """Name of the colour of each state in the bars."""
 
