@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from services.planner.law.assist import STILL_RATE_PITCH, STILL_RATE_Z
 from services.planner.law.hocca import KNEES
 from services.planner.law.kinematics import Kinematics
+from services.planner.watch.park import BENT, PITCHED
 from shared.arrays import Array
 from shared.bus import topics
 from shared.bus.messages import JointState, PlannerMode, PlannerStatus, Wrench
@@ -39,9 +40,6 @@ BUMP_N: Final = 22.0
 """N; a led squat peaks there."""
 BUMP_S: Final = 0.05
 RESTS_N: Final = 20.0
-BENT: Final = -1.25
-"""rad; more bent knees are a working pose, and so is a torso pitched by more than `PITCHED`."""
-PITCHED: Final = 0.3
 GRID_S: Final = 0.04
 """Rates are differences over this time."""
 PHASES: Final = ("stand", "down", "work", "up")

@@ -115,7 +115,7 @@ class FallWatch:
         Args:
             s: this watch's state, which changes.
             now_ns: the planner's clock.
-            modes: of the six modules; while none is stiff nobody falls harder.
+            modes: of the six modules; if none is stiff there is nothing to let go of.
             seen: what this tick sees.
         """
         if s.fell_ns:

@@ -46,7 +46,7 @@ LASTS_NS: Final = 50 * NS_PER_MS
 BUMPED_NS: Final = 300 * NS_PER_MS
 """How long a bump is reported."""
 AWAY: Final = (3.0, 1.0)
-"""N and N m; nobody's hand is weaker."""
+"""N and N m; any hand on the harness is stronger."""
 AWAY_NS: Final = NS_PER_S // 2
 PULL: Final = 25.0
 """N along the floor."""
@@ -159,7 +159,7 @@ class ParkLaw:
         knee, _, kg = touch.pose
         rest = max(0.0, -touch.lifted + GRAVITY * min(0.0, kg))
         cap = self._force_max * clamp((knee - CAP[0]) / (CAP[1] - CAP[0]), 0.0, 1.0)
-        rate = (min(rest, cap) - s.assist) / FOLLOW_S
+        lacks = min(rest, cap) - s.assist
         if s.wearing is Wearing.LEADS:
-            rate = min(0.0, rate)
-        s.assist += min(1.0, dt / FOLLOW_S) * FOLLOW_S * rate
+            lacks = min(0.0, lacks)
+        s.assist += min(1.0, dt / FOLLOW_S) * lacks
