@@ -353,9 +353,11 @@ class Planner:
             knee = max(float(inputs.q[right]), float(inputs.q[left]))
             kg = s.law.load.kg - s.trust.load[0]
             z, pitch = float(output.pdot[2]), float(output.pdot[4])
+            height = s.law.height
+            sinks = height.hold[0] * (height.height - float(output.p[2]))
             touch = Touch(
                 s.heat.lifted, wrench.moment[1], wrench.force[:2],
-                (knee, float(output.p[4]), kg), (z, pitch),
+                (knee, float(output.p[4]), kg), (z, pitch), sinks,
             )  # fmt: skip
         may = not s.engagement.hold and inputs.request.assist_n == 0.0
         may = may and not self._sits and not s.heat.moves

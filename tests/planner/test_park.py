@@ -12,6 +12,7 @@ from services.planner.watch.park import (
     CAP,
     FOLLOW_S,
     LASTS_NS,
+    LIFTS,
     PITCHED,
     PULL,
     PULL_NS,
@@ -28,7 +29,7 @@ from tests.robots import ROBOT
 T0 = 5_000_000_000
 PARK = msgspec.structs.replace(ROBOT.park, enabled=True)
 STILL_NS = round(PARK.still_s * NS_PER_S)
-CROUCHED = Touch(-10.0, 0.0, (0.0, 0.0), (CAP[1], 0.0, 0.0), (0.0, 0.0))
+CROUCHED = Touch(-10.0, 0.0, (0.0, 0.0), (CAP[1], 0.0, 0.0), (0.0, 0.0), 0.0)
 """Somebody rests 10 N on it."""
 
 
@@ -85,6 +86,15 @@ def test_parked_the_assist_follows_what_rests_and_led_it_only_falls(parked: Worn
     parked.feel(CROUCHED._replace(lifted=-150.0), NS_PER_S, may=False)
     assert parked.assist == pytest.approx(80.0, abs=1.0)
     parked.feel(CROUCHED, 5 * NS_PER_S, may=False)
+    assert parked.assist == pytest.approx(10.0, abs=0.1)
+
+
+def test_a_parked_robot_that_sank_lifts_itself_and_a_led_one_does_not(parked: Worn) -> None:
+    """Friction hides a part of the load, and the person's legs take up another."""
+    sunk = CROUCHED._replace(sinks=0.005)
+    parked.feel(sunk, 5 * NS_PER_S)
+    assert parked.assist == pytest.approx(10.0 + FOLLOW_S * LIFTS * 0.005, abs=0.1)
+    parked.feel(sunk, 5 * NS_PER_S, may=False)
     assert parked.assist == pytest.approx(10.0, abs=0.1)
 
 

@@ -27,6 +27,7 @@ from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import PushIntegral, UncoupledGains, Y
 from services.planner.law.model import BodyInertia
 from services.planner.law.split import CouplingGains, GainLaw
+from services.planner.watch.park import LIFTS
 from shared.arrays import Array
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES, N_JOINTS, N_LEG
@@ -227,8 +228,8 @@ class DynamicCertificate:
         stand, half = c.node.stand, self._halves[c.half]
         if c.mode in TRACK + PARKED:
             feedback = self.feedback(c.node, design)
-            if c.mode in PARKED:  # the hand leads nothing, so nothing is eased
-                stand, feedback = stand._replace(S=np.zeros(6)), feedback._replace(lead_easing=0.0)
+            if c.mode in PARKED:
+                stand, feedback = stand._replace(S=np.zeros(6)), feedback._replace(lifts=LIFTS)
             if not c.integral:
                 feedback = feedback._replace(integral_gain=0.0)
         else:

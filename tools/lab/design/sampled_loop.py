@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from services.planner.law.certificate import motor_mean
 from services.planner.law.coupling import pole_gain
+from services.planner.watch.park import FOLLOW_S
 from shared.arrays import Array
 from shared.extras import late
 from shared.joints import N_JOINTS, N_LEG
@@ -108,6 +109,9 @@ class Feedback(NamedTuple):
     """N/(m s)"""
     seen: Array = np.eye(N_JOINTS)
     """(12, 12): the local loops see `seen` q; the identity, but while an encoder is blind."""
+    lifts: float = 0.0
+    """N/s per metre by which a parked robot's assist rises below its height. Above 0 the assist
+    also follows the hand's force, and nothing is eased (`services.planner.watch.park`)."""
 
 
 class Gains(NamedTuple):
@@ -191,7 +195,8 @@ class _Laws(NamedTuple):
     """J and T of the coordinates that the planner takes as measured."""
     ease_p: Array
     ease_v: Array
-    """(n_c, n_p): part of tau_coupled that eases the hand's force, per p and p'."""
+    """(n_c, n_p): part of tau_coupled that eases the hand's force, or the assist that follows it,
+    per p and p'."""
     integral: Array
     """(1, n): the row of J that is integrated; (0, n) where there is none."""
     integrated: Array
@@ -364,6 +369,8 @@ class SampledLoop:
         f_1 = f_1 + gain * (raw - f_1)
         f_2 = f_2 + gain * (f_1 - f_2)
         gain = pole_gain(self.feedback.easing_bandwidth_hz, period)
+        if self.feedback.lifts > 0.0:
+            gain = period / FOLLOW_S
         felt = laws.ease_p @ x[at.p] + laws.ease_v @ x[at.pd]
         eased = eased + gain * (felt - eased)
         return f_1, f_2, eased, F_I, np.vstack((r, rate, f_2 + eased))
@@ -396,6 +403,10 @@ def _laws(
     C_q, C_v = V.T @ feedback.C_q @ V, V.T @ feedback.C_v @ V
     ease_p = -alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1])
     ease_v = -alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1])
+    if feedback.lifts > 0.0:  # A' = (rest - A) / FOLLOW_S - lifts z, rest by the hand alone
+        rise = feedback.lifts * FOLLOW_S * (P.T @ np.eye(6)[2])
+        ease_p = hand.k_z * easing[0] - np.outer(V.T @ stand.J_harness[2], rise)
+        ease_v = hand.b_z * easing[0]
     coupled = linalg.orth(np.hstack((C_q, C_v, integral.T, ease_p, ease_v)), rcond=ROUNDING)
     return _Laws(
         D=D,

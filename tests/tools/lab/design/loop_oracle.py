@@ -65,6 +65,8 @@ class Loop:
     bandwidth_hz: float  # corner of each of the two coupling filters
     lead_easing: float  # share of the hand's force that is eased
     easing_bandwidth_hz: float
+    lifts: float  # above 0: an assist follows the hand within follow_s, and lifts, N/s per metre
+    follow_s: float
     integral: Array  # (12,) body rate per joint rates, of what the planner integrates
     integral_gain: float  # growth of its force per error, N/(m s)
     k: float  # drivetrain stiffness
@@ -181,8 +183,20 @@ class _Planner:
         raw = raw + np.outer(loop.integral, self.force)
         self.f1 = self.f1 + self.a * (raw - self.f1)
         self.f2 = self.f2 + self.a * (self.f1 - self.f2)
-        self.e = self.e + self.a_e * (self._felt(p, p_dot) - self.e)
+        if loop.lifts:
+            self.e = self.e + loop.planner_period * self._assist_rate(p, p_dot)
+        else:
+            self.e = self.e + self.a_e * (self._felt(p, p_dot) - self.e)
         return _Command(time, r, rdot, self.f2 + self.e)
+
+    def _assist_rate(self, p: Array, p_dot: Array) -> Array:
+        """The rate of the joint torques of a parked robot's assist."""
+        loop = self.loop
+        k_z, b_z, _, _ = loop.hand
+        z_dot = loop.J_harness[UP] @ loop.T @ p_dot
+        weighs = k_z * (loop.J_harness[UP] @ loop.T @ p) + b_z * z_dot
+        rises = weighs / loop.follow_s - loop.lifts * p[UP]
+        return np.outer(loop.J_harness[UP], rises) - self.e / loop.follow_s
 
     def _felt(self, p: Array, p_dot: Array) -> Array:
         """The joint torques that ease the hand's force."""
