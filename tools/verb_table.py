@@ -114,6 +114,7 @@ VERBS: Final = (
     Verb("log recover", "make a complete log from one that was cut off"),
     Verb("log play", "put a log back onto a bus of its own, under replay/"),
     Verb("log report", "write a run as one page: plots, timeline, torques, versions"),
+    Verb("log wearer", "measure a person's thresholds of park, for the robot's wearer file"),
     Verb("log export", "write a run in other formats: picture, CSV, ROS 2 bag"),
     Verb("log explain", "break one planner tick down: gains, margins, torque by origin"),
     Verb("log resim", "run a log's services again and compare, bit for bit or changed"),

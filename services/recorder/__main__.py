@@ -27,7 +27,7 @@ from shared.bus import topics
 from shared.bus.session import open_session
 from shared.clock import keep_pace, now_ns, pace
 from shared.config import gain_schedule
-from shared.config.files import load
+from shared.config.files import load, wearer_path
 from shared.config.robot_config import SERVICES
 from shared.config.sections import RecorderConfig
 from shared.exceptions import ConfigError, RunError
@@ -172,9 +172,11 @@ def _services(text: str) -> tuple[str, ...]:
 
 def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
     files: dict[str, Path] = {"robot.toml": arguments.config}
-    schedule = gain_schedule.path_beside(arguments.config)
-    if schedule.is_file():
-        files["robot.gains.json"] = schedule
+    beside = {
+        "robot.gains.json": gain_schedule.path_beside(arguments.config),
+        "robot.wearer.toml": wearer_path(arguments.config),
+    }
+    files |= {name: path for name, path in beside.items() if path.is_file()}
     if arguments.scenario is not None:
         files["scenario.toml"] = arguments.scenario
     for text in arguments.attach:

@@ -1,4 +1,7 @@
-"""Reads and writes a robot file, `deploy/robot.toml`, with the gain schedule beside it.
+"""Reads and writes a robot file, `deploy/robot.toml`, with what stands beside it.
+
+The gain schedule, `robot.gains.json`, and the thresholds of the person who wears the robot,
+`robot.wearer.toml`, are files of their own: one follows from the robot, the other from the person.
 
 Unknown keys, wrong sizes and impossible values are refused with the file, the key, the value and
 what would be right (`shared.exceptions.ConfigError`).
@@ -14,18 +17,33 @@ import tomli_w
 from shared.config import checks as config_check
 from shared.config import gain_schedule
 from shared.config.robot_config import RobotConfig
+from shared.config.sections import WearerThresholds
 from shared.exceptions import ConfigError
 from shared.toml_file import parse_toml, read_toml
 
 
 def load(path: Path) -> RobotConfig:
-    """Read and check a robot file, with the gain schedule beside it if there is one.
+    """Read and check a robot file, with the gain schedule and the wearer's file beside it, if any.
 
     Raises ConfigError if a file cannot be read, or a key or value is not as it should be.
     """
     config = load_without_schedule(path)
+    wearer = wearer_path(path)
+    if wearer.exists():
+        config = worn_by(config, read_toml(wearer, WearerThresholds))
     schedule = gain_schedule.read(gain_schedule.path_beside(path))
     return msgspec.structs.replace(config, gain_schedule=schedule)
+
+
+def wearer_path(robot_file: Path) -> Path:
+    """Return the path of a robot's wearer: lab.toml -> lab.wearer.toml."""
+    return robot_file.with_suffix(".wearer.toml")
+
+
+def worn_by(config: RobotConfig, wearer: WearerThresholds) -> RobotConfig:
+    """Return the robot with a person's thresholds."""
+    park = msgspec.structs.replace(config.park, **msgspec.structs.asdict(wearer))
+    return msgspec.structs.replace(config, park=park)
 
 
 def load_without_schedule(path: Path) -> RobotConfig:

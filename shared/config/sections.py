@@ -185,16 +185,21 @@ class AssistConfig(Section, frozen=True):
     fade_s: Annotated[float, Range(0.5, 60.0, "s")] = 5.0
 
 
-class ParkConfig(Section, frozen=True):
-    """Lets a person rest on a robot that stands still, crouched (docs/law.md#park)."""
+class WearerThresholds(Section, frozen=True):
+    """What differs between the persons who wear a robot; `xrl log wearer` measures it."""
 
-    enabled: bool = False
     open_n: Annotated[float, Range(10.0, 100.0, "N")] = 22.0
     """Net pull up that opens it; the peak of a led squat."""
     open_back_nm: Annotated[float, Range(2.0, 50.0, "N m")] = 6.0
     """Moment backwards that opens it."""
     still_s: Annotated[float, Range(0.1, 5.0, "s")] = 1.0
     """Time for which it must be still before it parks."""
+
+
+class ParkConfig(WearerThresholds, frozen=True):
+    """Lets a person rest on a robot that stands still, crouched (docs/law.md#park)."""
+
+    enabled: bool = False
 
 
 LocalStiffness = Annotated[float, Range(0.0, 1e4, "N m/rad")]

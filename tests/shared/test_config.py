@@ -296,3 +296,15 @@ def test_masses_and_joint_limits_are_those_of_the_file_and_all_interfaces_are_kn
     assert rows[:6] == rows[6:]
     assert rows[2:4] == (robot.limits.knee.phi, robot.limits.knee.theta)
     assert set(INTERFACES) == set(can.VALID_INTERFACES)
+
+
+def test_the_file_of_the_person_who_wears_it_stands_beside_the_robot_file(tmp_path: Path) -> None:
+    robot_file, wearer = tmp_path / "lab.toml", tmp_path / "lab.wearer.toml"
+    robot_file.write_text(ROBOT_FILE.read_text())
+    wearer.write_text("open_n = 31.0\nopen_back_nm = 7.5\nstill_s = 0.6\n")
+    park = config_file.load(robot_file).park
+    assert (park.open_n, park.open_back_nm, park.still_s) == (31.0, 7.5, 0.6)
+    assert park.enabled == config_file.load(ROBOT_FILE).park.enabled
+    wearer.write_text("open_n = 310.0\n")
+    with pytest.raises(ConfigError, match=r"lab\.wearer\.toml: open_n: 310"):
+        config_file.load(robot_file)

@@ -12,26 +12,33 @@ assist that is requested, v and omega the rates of the harness point and of the 
     resting : -f > `RESTS_N` while the robot is still
 
 Forces are those of a hand too: while it leads, the person's push up or down is missing or added.
+
+`thresholds_of` measures what park must know of a person (docs/law.md#park), from a log in which
+they stood, squatted and rested: how hard they pull when they lead up, and when they do not mean
+to, and how long they pause at the turn of a squat.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, get_type_hints
 
 import msgspec
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from services.planner.law.assist import STILL_RATE_PITCH, STILL_RATE_Z
 from services.planner.law.hocca import KNEES
 from services.planner.law.kinematics import Kinematics
-from services.planner.watch.park import BENT, PITCHED
+from services.planner.watch.park import BENT, LASTS_NS, PITCHED
 from shared.arrays import Array
 from shared.bus import topics
-from shared.bus.messages import JointState, PlannerMode, PlannerStatus, Wrench
+from shared.bus.messages import JointState, PlannerMode, PlannerStatus, Wearing, Wrench
 from shared.clock import NS_PER_S
 from shared.config.robot_config import GRAVITY, RobotConfig
+from shared.config.sections import WearerThresholds
+from shared.exceptions import RunError
 from shared.joints import MODULES
 from tools.logs.run_log import RunLog
 
@@ -40,6 +47,15 @@ BUMP_N: Final = 22.0
 """N; a led squat peaks there."""
 BUMP_S: Final = 0.05
 RESTS_N: Final = 20.0
+SQUATS_MIN: Final = 2
+WORK_MIN_S: Final = 5.0
+IDLE_MARGIN: Final = 1.25
+"""Of the largest pull of a person who does not mean to lead."""
+PAUSE_MARGIN: Final = 1.25
+PAUSE_MAX_S: Final = 2.0
+STILL_MIN_S: Final = 0.5
+LEADS_FROM_S: Final = 0.4
+"""A person pulls before the robot moves, and after; neither is a rest."""
 GRID_S: Final = 0.04
 """Rates are differences over this time."""
 PHASES: Final = ("stand", "down", "work", "up")
@@ -100,6 +116,125 @@ class _Motion(NamedTuple):
     """M g, N."""
     assist: Array
     """A, N."""
+    led: NDArray[np.bool_]
+    """The planner leads, and the robot is not parked."""
+
+
+class _Felt(NamedTuple):
+    """What the harness measured, by its own samples."""
+
+    t: Array
+    """s"""
+    force: Array
+    """(n, 3), N, torso axes."""
+    f: Array
+    """N, upwards."""
+    moment: Array
+    """About pitch, N m."""
+    at: NDArray[np.intp]
+    """Index of the motion then."""
+
+
+class MeasuredThresholds(NamedTuple):
+    """What park must know of a person, and how it was found."""
+
+    thresholds: WearerThresholds
+    squats: int
+    why: tuple[str, ...]
+    """Each threshold, with what it follows from."""
+    doubts: tuple[str, ...]
+
+
+def thresholds_of(log: RunLog, robot: RobotConfig) -> MeasuredThresholds:
+    """Return a person's thresholds of park, in the ranges of the robot file.
+
+    Args:
+        log: a person stood, squatted at least twice, and rested in a crouch, led by the planner.
+        robot: the robot of the log; its own threshold stays where the log shows nothing.
+
+    Raises:
+        RunError: the log does not show that.
+    """
+    motion, felt = _read(log, robot)
+    if motion is None or felt is None:
+        raise RunError(f"{log.path}: no harness, planner and joints in it, or it was never led")
+    led, phase = motion.led, motion.phase
+    still = led & motion.still
+    rests = _eroded(still, round(LEADS_FROM_S / GRID_S))
+    work_s = float(np.count_nonzero(still & (phase == PHASES.index("work")))) * GRID_S
+    pauses = _pauses(np.where(led, phase, -1), motion.t_ns / NS_PER_S)
+    if len(pauses) < SQUATS_MIN or work_s < WORK_MIN_S:
+        raise RunError(
+            f"{log.path}: {len(pauses)} squats and {work_s:.0f} s still in a crouch, led; needed "
+            f"are {SQUATS_MIN} and {WORK_MIN_S:.0f} s: stand, squat down and up three times "
+            "without a stop, and rest in a crouch, with park off"
+        )
+    up, idle = (led & (phase == PHASES.index("up")))[felt.at], rests[felt.at]
+    park, doubts = robot.park, []
+    leads_n, rests_n = (_lasting(felt.f, inside, felt.t) for inside in (up, idle))
+    open_n = max(leads_n, IDLE_MARGIN * rests_n)
+    if rests_n * IDLE_MARGIN > leads_n:
+        doubts.append(
+            f"at rest this person pulls by up to {rests_n:.0f} N, leading up by {leads_n:.0f} N: "
+            f"a parked robot would open by itself below {open_n:.0f} N"
+        )
+    why = [f"open_n: led up with {leads_n:.1f} N, at rest at most {rests_n:.1f} N"]
+    open_back_nm = park.open_back_nm
+    if np.ptp(motion.turned[led, 1]) > PITCHED:
+        back, idle_back = (_lasting(-felt.moment, inside, felt.t) for inside in (up, idle))
+        open_back_nm = max(back, IDLE_MARGIN * idle_back)
+        why.append(f"open_back_nm: led back with {back:.1f} N m, at rest {idle_back:.1f} N m")
+    else:
+        why.append("open_back_nm: as in the robot file; the torso was never pitched")
+    why.append(f"still_s: the longest pause at the turn of a squat is {max(pauses):.2f} s")
+    return MeasuredThresholds(
+        WearerThresholds(
+            open_n=_in_range("open_n", open_n),
+            open_back_nm=_in_range("open_back_nm", open_back_nm),
+            still_s=_in_range("still_s", max(STILL_MIN_S, PAUSE_MARGIN * max(pauses))),
+        ),
+        len(pauses), tuple(why), tuple(doubts),
+    )  # fmt: skip
+
+
+def _eroded(inside: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
+    """Return what is inside and as many samples away from all that is not."""
+    padded = np.pad(inside, by, constant_values=True)
+    return np.asarray(sliding_window_view(padded, 2 * by + 1).all(axis=1))
+
+
+def _in_range(key: str, value: float) -> float:
+    """Return a threshold rounded, and inside its range of the robot file."""
+    hint = get_type_hints(WearerThresholds, include_extras=True)[key]
+    low, high, _ = hint.__metadata__[0]
+    return float(round(min(high, max(low, value)), 2))
+
+
+def _lasting(values: Array, inside: NDArray[np.bool_], t: Array) -> float:
+    """Return the largest value that lasts as long as what opens park; at least 0."""
+    width = max(1, round(LASTS_NS / NS_PER_S / float(np.median(np.diff(t)))))
+    kept = np.where(inside, values, 0.0)
+    if len(kept) < width:
+        return 0.0
+    return max(0.0, float(sliding_window_view(kept, width).min(axis=1).max()))
+
+
+def _pauses(phase: NDArray[np.intp], t: Array) -> list[float]:
+    """Return how long each way down was followed by a still crouch before the way up, s.
+
+    A longer stay than `PAUSE_MAX_S` is no turn.
+    """
+    down, work, rise = (PHASES.index(name) for name in ("down", "work", "up"))
+    bounds = np.flatnonzero(np.diff(phase, prepend=-2))
+    runs = [(int(phase[i]), float(t[i])) for i in bounds]
+    runs.append((-1, float(t[-1])))
+    found = []
+    for (before, _), (now, from_s), (after, to_s) in zip(runs, runs[1:], runs[2:], strict=False):
+        if (before, now, after) == (down, work, rise) and to_s - from_s < PAUSE_MAX_S:
+            found.append(to_s - from_s)
+        elif (now, after) == (down, rise):
+            found.append(0.0)
+    return found
 
 
 def wearer_figures(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> WearerFigures | None:
@@ -110,28 +245,14 @@ def wearer_figures(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> WearerF
         robot: the robot of the log.
         from_ns: monotonic time; 0: when the planner first leads in it.
     """
-    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
-    leads = (row.t_ns for row in statuses if row.mode == PlannerMode.LEADING)
-    from_ns = from_ns or next(leads, 1 << 62)
-    wrenches: list[Wrench] = [
-        row
-        for row in log.messages(topics.WRENCH)
-        if row.valid and row.t_ns >= from_ns and log.holds(row.t_ns)
-    ]
-    motion = _motion(log, robot, [row for row in statuses if row.t_ns >= from_ns])
-    if motion is None or len(wrenches) < 2:
+    motion, felt = _read(log, robot, from_ns)
+    if motion is None or felt is None:
         return None
-    t_ns = np.array([row.t_ns for row in wrenches])
-    at = np.clip(np.searchsorted(motion.t_ns, t_ns, side="right") - 1, 0, None)
-    force = np.array([row.force for row in wrenches])
-    moment = np.array([row.moment[1] for row in wrenches])
-    roll, pitch = motion.turned[at].T
-    x, y, z = force.T
-    f = np.sin(roll) * y + np.cos(roll) * (z * np.cos(pitch) - x * np.sin(pitch))
-    dt = np.minimum(np.diff(t_ns, append=t_ns[-1]) / NS_PER_S, GRID_S)
+    t, at, f, moment, force = felt.t, felt.at, felt.f, felt.moment, felt.force
+    dt = np.minimum(np.diff(t, append=t[-1]), GRID_S)
     power = f * motion.rates[at, 0] + moment * motion.rates[at, 1]
     size = np.linalg.norm(force, axis=1)
-    bumps = _bumps(f, t_ns / NS_PER_S)
+    bumps = _bumps(f, t)
     carried, asked = motion.load[at] - f, motion.load[at] + motion.assist[at]
     return WearerFigures(
         phases=_by_phase(motion.phase[at], dt, carried, asked),
@@ -142,6 +263,29 @@ def wearer_figures(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> WearerF
         bump_peak_n=max(bumps, default=0.0),
         resting_s=float(dt[(-f > RESTS_N) & motion.still[at]].sum()),
     )
+
+
+def _read(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> tuple[_Motion | None, _Felt | None]:
+    """Return how the robot moved and what its harness felt; None where the log has nothing."""
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    leads = (row.t_ns for row in statuses if row.mode == PlannerMode.LEADING)
+    from_ns = from_ns or next(leads, 1 << 62)
+    wrenches: list[Wrench] = [
+        row
+        for row in log.messages(topics.WRENCH)
+        if row.valid and row.t_ns >= from_ns and log.holds(row.t_ns)
+    ]
+    motion = _motion(log, robot, [row for row in statuses if row.t_ns >= from_ns])
+    if motion is None or len(wrenches) < 2:
+        return motion, None
+    t_ns = np.array([row.t_ns for row in wrenches])
+    at = np.clip(np.searchsorted(motion.t_ns, t_ns, side="right") - 1, 0, None)
+    force = np.array([row.force for row in wrenches])
+    moment = np.array([row.moment[1] for row in wrenches])
+    roll, pitch = motion.turned[at].T
+    x, y, z = force.T
+    f = np.sin(roll) * y + np.cos(roll) * (z * np.cos(pitch) - x * np.sin(pitch))
+    return motion, _Felt((t_ns - from_ns) / NS_PER_S, force, f, moment, at)
 
 
 def merged_figures(parts: Sequence[WearerFigures]) -> WearerFigures:
@@ -210,6 +354,7 @@ def _motion(log: RunLog, robot: RobotConfig, statuses: Sequence[PlannerStatus]) 
     falls = np.where(np.abs(pdot[:, 2]) > STILL_RATE_Z, pdot[:, 2] < 0.0, pdot[:, 4] > 0.0)
     stand, down, work, rise = range(len(PHASES))
     phase = np.where(still, np.where(works, work, stand), np.where(falls, down, rise))
+    led = [row.mode == PlannerMode.LEADING and row.wearer == Wearing.LEADS for row in rows]
     kg = robot.mass.payload + np.array([row.load[0] for row in rows])
     return _Motion(
         t_ns=t_ns,
@@ -219,6 +364,7 @@ def _motion(log: RunLog, robot: RobotConfig, statuses: Sequence[PlannerStatus]) 
         turned=p[:, 3:5],
         load=GRAVITY * kg,
         assist=np.array([row.assist_requested_n for row in rows]),
+        led=np.array(led),
     )
 
 

@@ -27,9 +27,10 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
 from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
+from shared.config.sections import WearerThresholds
 from shared.exceptions import RunError
 from shared.mcap_log.sequence_stats import KeyCount
-from shared.toml_file import decoded
+from shared.toml_file import decoded, parse_toml
 from tools.logs.run_index import RunIndex
 from tools.topic_keys import sender_of
 
@@ -353,6 +354,9 @@ def robot_of(log: RunLog | RunIndex) -> RobotConfig:
     """Return the robot that a log was made with."""
     raw = text_of(log, "robot.toml")
     robot = config_file.parse(raw, f"{log.path}: robot.toml")
+    if "robot.wearer.toml" in log.attachments:
+        text, name = text_of(log, "robot.wearer.toml"), f"{log.path}: robot.wearer.toml"
+        robot = config_file.worn_by(robot, parse_toml(text, name, WearerThresholds))
     schedule = log.attachments.get("robot.gains.json")
     if schedule is None:
         return robot

@@ -13,10 +13,19 @@ from shared.bus.messages import JointState, PlannerMode, PlannerStatus, Wrench
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_S
 from shared.config.robot_config import GRAVITY
+from shared.exceptions import RunError
 from shared.joints import kind_of
 from tests.messages import sample
 from tests.robots import ROBOT
-from tools.judge.wearer import RESTS_N, WearerFigures, merged_figures, wearer_figures
+from tools.judge.wearer import (
+    IDLE_MARGIN,
+    PAUSE_MARGIN,
+    RESTS_N,
+    WearerFigures,
+    merged_figures,
+    thresholds_of,
+    wearer_figures,
+)
 from tools.logs.run_log import NewestAt, RunLog
 
 SPAN_S = 4.0
@@ -38,8 +47,10 @@ class MadeLog:
         kg: float = 0.0,
         mode: PlannerMode = PlannerMode.LEADING,
         until_s: float = math.inf,
+        span_s: float = SPAN_S,
     ) -> None:
-        ticks = [0.004 * tick for tick in range(round(SPAN_S / 0.004) + 1)]
+        self.path = "made.mcap"
+        ticks = [0.004 * tick for tick in range(round(span_s / 0.004) + 1)]
         angles = {"ankle": 1.0, "knee": -2.0, "hip": 1.0}
         self._until_ns = until_s * NS_PER_S
         self._states = {
@@ -54,7 +65,8 @@ class MadeLog:
             topics.PLANNER_STATUS: [
                 sample(
                     PlannerStatus,
-                    t_ns=round(t * NS_PER_S), mode=int(mode), p=(0.0,) * 6, stance=(0.0,) * 6,
+                    t_ns=round(t * NS_PER_S), mode=int(mode), wearer=0, p=(0.0,) * 6,
+                    stance=(0.0,) * 6,
                     pdot=(0.0, 0.0, reach * (math.cos(fold(t + 1e-3)) - math.cos(fold(t))) * 1e3,
                           0.0, 0.0, 0.0),
                     assist_requested_n=assist, load=(kg, 0.0, 0.0),
@@ -66,7 +78,7 @@ class MadeLog:
                     Wrench, t_ns=round(t * NS_PER_S), valid=True,
                     force=(0.0, 0.0, force(t)), moment=(0.0, 0.0, 0.0),
                 )
-                for t in (0.005 * step for step in range(round(SPAN_S / 0.005)))
+                for t in (0.005 * step for step in range(round(span_s / 0.005)))
             ],
         }  # fmt: skip
 
@@ -155,3 +167,44 @@ def test_the_figures_of_a_run_are_those_of_its_parts() -> None:
 def test_without_a_planner_that_led_there_are_none() -> None:
     held = MadeLog(lambda _t: 0.0, mode=PlannerMode.ALIGNING)
     assert wearer_figures(cast(RunLog, held), ROBOT) is None
+
+
+MINUTE_S = 22.0
+PAUSE_S = 0.6
+
+
+def minute(t: float) -> float:
+    """Return the fold of three squats, 4 s each and with a pause at the turn, and a crouch."""
+    if t >= 12.0:
+        return UPRIGHT + (DEEP - UPRIGHT) * min(1.0, (t - 12.0) / 1.0)
+    t %= 4.0
+    rises = t - 1.0 - PAUSE_S
+    return UPRIGHT + (DEEP - UPRIGHT) * max(0.0, min(1.0, t, 1.0 - rises))
+
+
+def test_a_persons_thresholds_follow_from_how_they_squat_and_rest() -> None:
+    """A pull before the robot moves belongs to the lead, and one of 20 ms opens nothing."""
+
+    def force(t: float) -> float:
+        if t > 12.0:
+            return 80.0 if 16.0 <= t < 16.02 else 4.0
+        return 18.0 if 1.4 <= t % 4.0 < 2.7 else -10.0
+
+    found = thresholds_of(cast(RunLog, MadeLog(force, minute, span_s=MINUTE_S)), ROBOT)
+    assert found.squats == 3
+    assert found.thresholds.open_n == pytest.approx(18.0, abs=0.5)
+    assert found.thresholds.still_s == pytest.approx(PAUSE_MARGIN * PAUSE_S, abs=0.15)
+    assert found.thresholds.open_back_nm == ROBOT.park.open_back_nm
+    assert not found.doubts
+
+
+def test_a_person_who_pulls_harder_at_rest_than_they_lead_is_told_so() -> None:
+    log = MadeLog(lambda t: 24.0 if t > 14.0 else 12.0, minute, span_s=MINUTE_S)
+    found = thresholds_of(cast(RunLog, log), ROBOT)
+    assert found.thresholds.open_n == pytest.approx(IDLE_MARGIN * 24.0, abs=0.5)
+    assert "open by itself" in found.doubts[0]
+
+
+def test_without_squats_and_a_rest_nothing_is_measured() -> None:
+    with pytest.raises(RunError, match=r"0 squats and 0 s still in a crouch.*three times"):
+        thresholds_of(cast(RunLog, MadeLog(lambda _t: 0.0)), ROBOT)
