@@ -80,8 +80,8 @@ NOUNS: Final = {
 
 PERSONS: Final = {
     "To run a robot": (
-        "new doctor up down status start kill estop rearm pendant lead view faults drive log topic "
-        "hosts keys ros2"
+        "new doctor up down status start kill estop rearm pendant lead cue view faults drive log "
+        "topic hosts keys ros2"
     ),
     "To study it": "demo sim inject study gains",
     "To develop it": "bench completion",
@@ -101,6 +101,7 @@ VERBS: Final = (
     Verb("rearm", "arm all modules again after a stop", "services:rearm"),
     Verb("pendant", "hold a dead man's handle", "estop:pendant"),
     Verb("lead", "lead by a gamepad or by keys"),
+    Verb("cue", "tell the wearer at once when the robot stops following, by sound"),
     Verb("view", "show the robot in a browser"),
     Verb("new", "make a robot's own directory"),
     Verb("doctor", "check drives, buses and computer"),

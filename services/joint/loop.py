@@ -67,7 +67,7 @@ _WHY_NOT: Final = {
 }
 
 
-class OtherModules(Protocol):
+class _OtherModules(Protocol):
     """What the joint services of a host know of each other, without a bus."""
 
     def view(self, now_ns: int, /) -> NeighbourView:
@@ -77,7 +77,7 @@ class OtherModules(Protocol):
         """Write down where this module is."""
 
 
-class SessionEnds(Protocol):
+class _SessionEnds(Protocol):
     """What is seen of the planner's process on this host."""
 
     def ended(self) -> int:
@@ -93,7 +93,7 @@ class JointPorts(msgspec.Struct, frozen=True):
     events: Outbox[JointEvent]
     traces: Outbox[JointTrace] | None
     """None: nothing is recorded for re-execution."""
-    planner: SessionEnds | None = None
+    planner: _SessionEnds | None = None
     """None: its end is not seen, and its commands grow old."""
 
 
@@ -107,7 +107,7 @@ class JointLoop:
         drive: Drive,
         ports: JointPorts,
         rearm_guard: RearmGuard | None = None,
-        neighbours: OtherModules | None = None,
+        neighbours: _OtherModules | None = None,
         clock: Callable[[], int] | None = None,
         heat_file: HeatFile | None = None,
     ) -> None:

@@ -11,10 +11,28 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from shared.bus.messages import Cause, DriveStatus, JointState, Mode, Outside, PlannerStatus, Trip
+from shared.bus.messages import (
+    Cause,
+    DriveStatus,
+    JointState,
+    Mode,
+    Outside,
+    PlannerStatus,
+    Trip,
+    Wearing,
+)
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import TripLimit, TripsConfig
 from shared.robot.fault_table import FALLEN_REMEDY, recovery_of
+
+WEARING: Final[dict[int, str]] = {
+    Wearing.LEADS: "",
+    Wearing.RESTS: "parked: a tug up opens it",
+    Wearing.AWAY: "parked, and nobody touches it",
+    Wearing.PULLS: "somebody pulls along the floor",
+    Wearing.BUMPED: "parked; a bump did not open it",
+}
+"""What a status says of the person, by its `wearer`."""
 
 
 class TripRow(NamedTuple):

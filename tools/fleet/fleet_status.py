@@ -42,7 +42,7 @@ from shared.config.endpoints import host_and_port
 from shared.config.robot_config import SERVICES, RobotConfig
 from shared.exceptions import FELL_EXIT_CODE, BusError, FleetError
 from shared.joints import MODULES
-from shared.robot.trip_table import reason_of, remedy_of
+from shared.robot.trip_table import WEARING, reason_of, remedy_of
 from tools.fleet import procfs
 from tools.fleet.proxy_client import ProxyClient
 from tools.fleet.run_dir import SPACE_LOW_MIB, free_mib_at
@@ -137,6 +137,8 @@ class LeadStatus(msgspec.Struct, frozen=True):
     session: int = 0
     carried_n: float = 0.0
     """What the robot carries of payload and person now, N, as in `PlannerStatus`."""
+    wearer: str = ""
+    """What it makes of the person, in words (`services.planner.watch.park`); empty if they lead."""
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
@@ -443,6 +445,7 @@ def _lead_status(message: Message | None) -> LeadStatus | None:
         reason_of(message),
         message.session,
         message.carried_n,
+        WEARING.get(message.wearer, ""),
     )
 
 

@@ -29,6 +29,8 @@ def _describe_lead(lead: LeadStatus | None) -> str:
     if lead is None:
         return "planner silent: each module holds by itself"
     words = f"planner {lead.mode}, margin {lead.margin:.2f}, carries {lead.carried_n:.0f} N"
+    if lead.wearer:
+        words += f"; {lead.wearer}"
     if lead.wait_s > 0.0:
         words += f"; leads again in {lead.wait_s:.0f} s at the earliest, after drop-outs or trips"
     if lead.why:

@@ -135,7 +135,7 @@ class _Felt(NamedTuple):
     """Index of the motion then."""
 
 
-class MeasuredThresholds(NamedTuple):
+class _MeasuredThresholds(NamedTuple):
     """What park must know of a person, and how it was found."""
 
     thresholds: WearerThresholds
@@ -145,7 +145,7 @@ class MeasuredThresholds(NamedTuple):
     doubts: tuple[str, ...]
 
 
-def thresholds_of(log: RunLog, robot: RobotConfig) -> MeasuredThresholds:
+def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
     """Return a person's thresholds of park, in the ranges of the robot file.
 
     Args:
@@ -187,7 +187,7 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> MeasuredThresholds:
     else:
         why.append("open_back_nm: as in the robot file; the torso was never pitched")
     why.append(f"still_s: the longest pause at the turn of a squat is {max(pauses):.2f} s")
-    return MeasuredThresholds(
+    return _MeasuredThresholds(
         WearerThresholds(
             open_n=_in_range("open_n", open_n),
             open_back_nm=_in_range("open_back_nm", open_back_nm),

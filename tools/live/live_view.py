@@ -22,7 +22,7 @@ UNHEARD_S = 0.5
 """s; an older status of the planner is not shown."""
 
 
-class PlannerNews(Protocol):
+class _PlannerNews(Protocol):
     """Gives the planner's newest status (`shared.bus.session.Latest`)."""
 
     def take(self) -> PlannerStatus | None:
@@ -33,7 +33,7 @@ class LiveView:
     """A line that is renewed in a terminal, or printed once a second into a file."""
 
     def __init__(
-        self, console: Console, injects: Sequence[Inject] = (), planner: PlannerNews | None = None
+        self, console: Console, injects: Sequence[Inject] = (), planner: _PlannerNews | None = None
     ) -> None:
         self._injects = injects
         self._planner = planner

@@ -26,7 +26,7 @@ xrl sim --fault knee_left:encoder@4     # to see one
 """
 
 
-class FaultSection(NamedTuple):
+class _FaultSection(NamedTuple):
     """A table of faults, for a terminal and for a page."""
 
     title: str
@@ -72,9 +72,9 @@ def run(flags: FaultsFlags) -> int:
     return 0
 
 
-def sections(limits: TripsConfig) -> Iterator[FaultSection]:
+def sections(limits: TripsConfig) -> Iterator[_FaultSection]:
     """Yield the faults of drives, the losses and the trips."""
-    yield FaultSection(
+    yield _FaultSection(
         "A fault of a drive",
         """\
 The module goes to FAULT and the planner holds the other five. An axis that disarms floats; its
@@ -91,7 +91,7 @@ person removes the cause, then restarts the module's service (`xrl kill MODULE`)
             for kind, row in DRIVE_FAULTS.items()
         ],
     )  # fmt: skip
-    yield FaultSection(
+    yield _FaultSection(
         "A lost process or link, and the emergency stop",
         "A joint service holds its module while the planner or its link is gone.",
         ("lost", "module", "others", "you see", "it ends"),
@@ -99,7 +99,7 @@ person removes the cause, then restarts the module's service (`xrl kill MODULE`)
     )
     trips = [(cause.name, "the module", row) for cause, row in JOINT_TRIPS.items()]
     trips += [(number.name, "the planner", row) for number, row in PLANNER_TRIPS.items()]
-    yield FaultSection(
+    yield _FaultSection(
         "Trips",
         """\
 A trip takes the robot out of being led: a module, or the planner, notices that a quantity is beyond

@@ -38,6 +38,7 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import JOINTS, MODULES, SIDES
 from shared.robot.frames import ORIGIN, body_frames, capture_point
 from shared.robot.robot_model import ankle_positions
+from shared.robot.trip_table import WEARING
 from tools.fleet.fleet_status import module_status
 from tools.fleet.stalls import STALL_SHOWN_NS, stalls_of
 from tools.judge.reports.robot_pose import pose_of_legs
@@ -78,6 +79,8 @@ class PlannerShown(msgspec.Struct, frozen=True):
     """Seconds left at this load, as in `PlannerStatus`."""
     carried_n: float = 0.0
     """As in `PlannerStatus`."""
+    wearer: str = ""
+    """What it makes of the person, in words; empty if they lead."""
 
 
 class ShownProcess(msgspec.Struct, frozen=True):
@@ -268,6 +271,7 @@ def _shown(status: PlannerStatus) -> PlannerShown:
         height_ref=status.p_ref[2],
         heat_left_s=status.heat_left_s,
         carried_n=status.carried_n,
+        wearer=WEARING.get(status.wearer, ""),
     )
 
 

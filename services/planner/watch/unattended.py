@@ -59,7 +59,7 @@ PROOF_NS: Final = 120 * NS_PER_MS
 its peak rose by 5 to 32 N."""
 
 
-class OpenDirection(msgspec.Struct):
+class _OpenDirection(msgspec.Struct):
     """State of one open direction, in m or rad."""
 
     coast: float = 0.0
@@ -82,8 +82,8 @@ class Unattended(msgspec.Struct):
     """Pose in which it left the robot: height of the COM, m, and the torso's pitch, rad."""
     last_ns: int = 0
     """Time of the last tick."""
-    height: OpenDirection = msgspec.field(default_factory=OpenDirection)
-    pitch: OpenDirection = msgspec.field(default_factory=OpenDirection)
+    height: _OpenDirection = msgspec.field(default_factory=_OpenDirection)
+    pitch: _OpenDirection = msgspec.field(default_factory=_OpenDirection)
 
     @property
     def released(self) -> Released:
@@ -129,7 +129,7 @@ class Unattended(msgspec.Struct):
         return max(abs(pose[0] - self.left[0]), ARM * abs(pose[1] - self.left[1]))
 
 
-def _coast(direction: OpenDirection, rate: float, dt: float, *, felt: bool) -> None:
+def _coast(direction: _OpenDirection, rate: float, dt: float, *, felt: bool) -> None:
     """Update c, and the way beyond it."""
     if felt:
         direction.coast, direction.excess = rate, 0.0
@@ -139,7 +139,7 @@ def _coast(direction: OpenDirection, rate: float, dt: float, *, felt: bool) -> N
     direction.excess += dt * (rate - direction.coast)
 
 
-def _is_back(direction: OpenDirection, now_ns: int, hand: float, least: float) -> bool:
+def _is_back(direction: _OpenDirection, now_ns: int, hand: float, least: float) -> bool:
     """Return True if a hand has been on a direction for `HAND_BACK_NS`, or is not known."""
     if abs(hand) < least:
         direction.back_ns = 0

@@ -25,11 +25,12 @@ from shared.bus.messages import (
     Outside,
     Refusal,
     ToolRoster,
+    Wearing,
 )
 from shared.bus.session import Latest, place_of_tool
 from shared.clock import NS_PER_S, now_ns
 from shared.joints import MODULES
-from shared.robot.trip_table import JOINT_TRIPS
+from shared.robot.trip_table import JOINT_TRIPS, WEARING
 from tests.messages import joint_state
 from tools.fleet import fleet_status, procfs
 from tools.fleet.fleet_status import (
@@ -113,6 +114,10 @@ def test_a_module_without_states_is_not_guessed_at() -> None:
         (None, "planner silent: each module holds by itself"),
         (LeadStatus("LEADING", 0.0, 1.2), "planner LEADING, margin 1.20, carries 0 N"),
         (LeadStatus("ALIGNING", 12.3, 1.2), "leads again in 12 s"),
+        (
+            LeadStatus("LEADING", 0.0, 1.2, carried_n=310.0, wearer=WEARING[Wearing.RESTS]),
+            "carries 310 N; parked: a tug up opens it",
+        ),
         (
             LeadStatus("MISPLACED", 0.0, 1.2, "a foot is ahead"),
             "carries 0 N; a foot is ahead",

@@ -25,7 +25,7 @@ MACHINE: Final = {
 INCOMPLETE: Final = "incomplete: the recorder did not close the file"
 
 
-class RunVerdict(NamedTuple):
+class _RunVerdict(NamedTuple):
     """Verdict on a run."""
 
     sentence: str
@@ -62,18 +62,18 @@ class Judge:
         except XrlError as error:
             self._why_not = str(error)
 
-    def verdict(self, *, whole: bool = True) -> RunVerdict:
+    def verdict(self, *, whole: bool = True) -> _RunVerdict:
         """Return the verdict; a part of a run (`whole` is False) has figures alone."""
         if not self._summaries:
             said = merged_figures(self._wearer).describe() if self._wearer else ""
-            return RunVerdict(f"No verdict: {self._why_not}", None, [], wearer=said)
+            return _RunVerdict(f"No verdict: {self._why_not}", None, [], wearer=said)
         summary = verdict.merged(self._summaries)
         rows, said = verdict_table.rows(summary), ""
         if summary.wearer is not None:
             said = summary.wearer.describe()
         if not whole:
             what = "A part of a run, and its figures: no verdict"
-            return RunVerdict(what, None, rows, wearer=said)
+            return _RunVerdict(what, None, rows, wearer=said)
         text = io.StringIO()
         console = Console(file=text, width=200, color_system=None, soft_wrap=True)
         verdict_table.show(summary, console)
@@ -81,7 +81,7 @@ class Judge:
         cautions = verdict_table.stalls(summary)
         cautions += [] if summary.in_real_time else [lines[-2]]
         caution = " ".join(f"{line.rstrip('.')}." for line in cautions)
-        return RunVerdict(lines[-1], summary.sound, rows, caution, said)
+        return _RunVerdict(lines[-1], summary.sound, rows, caution, said)
 
 
 def _scenario_of(run: RunData) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def _scenario_of(run: RunData) -> dict[str, Any]:
 
 
 def verdict_and_facts(
-    run: RunData, found: RunVerdict, name: str, counts: dict[str, KeyCount]
+    run: RunData, found: _RunVerdict, name: str, counts: dict[str, KeyCount]
 ) -> str:
     """Return the head of the page."""
     word = {True: "good", False: "bad", None: "none"}[found.good]
@@ -116,7 +116,7 @@ def verdict_and_facts(
     )
 
 
-def _wearer(found: RunVerdict) -> list[tuple[str, str]]:
+def _wearer(found: _RunVerdict) -> list[tuple[str, str]]:
     name, _, figures = found.wearer.partition(": ")
     return [(name.lower(), figures)] if figures else []
 

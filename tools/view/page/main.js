@@ -169,7 +169,7 @@ function show(frame) {
   $("margin").textContent = planner ? planner.margin.toFixed(2) : "–";
   $("mode").textContent = planner ? planner.mode.toLowerCase() : "silent";
   $("planner").textContent = planner
-    ? [planner.why, planner.wait_s > 0 ? `leads again in ${planner.wait_s.toFixed(0)} s at the earliest` : "",
+    ? [planner.why, planner.wearer, planner.wait_s > 0 ? `leads again in ${planner.wait_s.toFixed(0)} s at the earliest` : "",
       planner.heat_left_s >= 0 && planner.heat_left_s < 3600 ? `motors: ${planner.heat_left_s.toFixed(0)} s left at this load` : "",
       `tick ${planner.tick_us?.toFixed(0) ?? "-"} µs, assist ${planner.assist_n.toFixed(0)} N, carries ${planner.carried_n.toFixed(0)} N`]
       .filter(Boolean).join("; ")

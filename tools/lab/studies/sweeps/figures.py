@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import msgspec
 
 from services.simulator.physics.plant import PlantConfig
-from shared.bus.messages import JointEvent, Message
+from shared.bus.messages import HandLead, JointEvent, Message, Mode
 from shared.bus.topics import Topic
 from shared.bus.traces import SimTruth
 from shared.config.impairment import Impairment
@@ -56,6 +56,10 @@ class Case(Protocol):
         """Return the simulated robot."""
 
 
+def ignore(_fleet: Lockstep, _row: SimTruth) -> None:
+    """Do nothing with a row of the world."""
+
+
 class CaseRun(NamedTuple):
     """What counts of a run: all until its end or the fall."""
 
@@ -89,7 +93,7 @@ def run_fleet(
     from_s: float = 0.0,
     kept: tuple[type[Message], ...] = (),
     fleet_type: type[Lockstep] = Lockstep,
-    each: Callable[[Lockstep, SimTruth], None] = lambda _fleet, _row: None,
+    each: Callable[[Lockstep, SimTruth], None] = ignore,
 ) -> CaseRun:
     """Run a case in virtual time to its end or to the fall.
 
@@ -121,6 +125,35 @@ def run_fleet(
         [row for row in fleet.events if row[1].t_ns <= end_ns],
         [row for row in messages if row[1].t_ns < end_ns],
     )
+
+
+class ReactingPerson:
+    """A hand that stops where it is, some time after the wearer is told that the robot holds.
+
+    `xrl cue` tells them. A scripted hand leads on instead: a person who notices nothing.
+    """
+
+    def __init__(self, reacts_s: float) -> None:
+        """Take the time from the cue to the stop, s; people need 0.2 to 0.4."""
+        self._reacts_s = reacts_s
+        self._stops_s: float | None = None
+        self._stopped = False
+
+    def __call__(self, fleet: Lockstep, row: SimTruth) -> None:
+        """See a row of the world; stop the hand once it is time."""
+        if self._stopped or row.scenario_s < 0.0:
+            return
+        if self._stops_s is None:
+            holds = any(one.failsafe.mode is not Mode.TRACK for one in fleet.controllers)
+            self._stops_s = row.scenario_s + self._reacts_s if holds else None
+        elif row.scenario_s >= self._stops_s:
+            self._stopped = True
+            fleet.lead(
+                HandLead(
+                    t_ns=0, seq=0, leads=True, height=row.torso[2], pitch=row.angles[1],
+                    push=(0.0, 0.0, 0.0), source="person",
+                )
+            )  # fmt: skip
 
 
 def until_fall(run: Iterable[SimTruth]) -> list[SimTruth]:

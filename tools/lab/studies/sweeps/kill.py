@@ -258,7 +258,7 @@ def row_of(case: KillCase) -> dict[str, object]:
     return row
 
 
-class KillResult(Ended, frozen=True, kw_only=True):
+class _KillResult(Ended, frozen=True, kw_only=True):
     """The figures of a case; None where there is nothing to measure.
 
     "After" is from the kill on, "before" from the scenario's start to the kill.
@@ -294,7 +294,7 @@ class KillResult(Ended, frozen=True, kw_only=True):
     """Largest distance of an ankle from its first place, mm."""
 
 
-def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) -> KillResult:
+def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) -> _KillResult:
     """Run a case to its end or to the fall, and measure it.
 
     The robot has the case's payload and a gain schedule that fits (`robots_of`).
@@ -312,12 +312,12 @@ def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) ->
     return measure(case, run, robot)
 
 
-def measure(case: KillCase, run: CaseRun, robot: RobotConfig) -> KillResult:
+def measure(case: KillCase, run: CaseRun, robot: RobotConfig) -> _KillResult:
     """Return the figures of a run."""
     rows, events, _ = run
     figures = run.ended(case.end_s, robot)
     if not run.began:
-        return KillResult(**figures)
+        return _KillResult(**figures)
     before = [row for row in rows if row.scenario_s < case.kill_s]
     if before:
         figures["operator_peak_before_n"] = operator_peak_n(before)
@@ -332,7 +332,7 @@ def measure(case: KillCase, run: CaseRun, robot: RobotConfig) -> KillResult:
         figures["kill_margin"] = statuses[-1].margin
         figures["kill_margin_onboard"] = statuses[-1].margin_onboard
     until_ns = killed[0] if killed else rows[-1].t_ns
-    return KillResult(holds_before=_drop_outs(events, rows[0].t_ns, until_ns), **figures)
+    return _KillResult(holds_before=_drop_outs(events, rows[0].t_ns, until_ns), **figures)
 
 
 def _after(rows: Sequence[SimTruth]) -> dict[str, float]:
@@ -506,7 +506,7 @@ STUDY: Final = Study[KillCase](
     cases=lambda flags, robot: partial(KillCases(robot, flags.push).draw, flags.seed),
     decided_by=("push",),
     row=row_of,
-    figures=KillResult,
+    figures=_KillResult,
     trial=run_case,
     robots=robots_of,
     report=partial(study.show_outcome, figures=FIGURES, describe=describe),

@@ -157,7 +157,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
         return plants.draw(f"latency {self.draw.fleet_seed}")
 
 
-class LatencyResult(Ended, frozen=True, kw_only=True):
+class _LatencyResult(Ended, frozen=True, kw_only=True):
     """The figures of a trial, over the bad network, to the end or the fall."""
 
     operator_peak_n: float | None = None
@@ -201,7 +201,7 @@ def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
 
 def run_trial(
     trial: LatencyTrial, robot: RobotConfig, observer: Observer = NOBODY
-) -> LatencyResult:
+) -> _LatencyResult:
     """Run a trial to its end or to the fall, and measure it."""
     draw = trial.draw
     run = run_fleet(
@@ -210,7 +210,7 @@ def run_trial(
         fleet_type=CONTROLS[trial.control].fleet,
     )  # fmt: skip
     if not run.began:
-        return LatencyResult(**run.ended(DURATION_S, robot))
+        return _LatencyResult(**run.ended(DURATION_S, robot))
     started = (m for _, m in run.messages if isinstance(m, RunEvent))
     from_ns = next(m.t_ns for m in started if m.kind == RunEventKind.STARTED)
     from_ns += round(draw.impaired_from_s * NS_PER_S)
@@ -221,7 +221,7 @@ def run_trial(
         if event.t_ns >= from_ns and event.mode_after in (Mode.HOLD, Mode.TRACK)
     ]
     into_hold = [module for module, event in since if event.mode_after == Mode.HOLD]
-    return LatencyResult(
+    return _LatencyResult(
         **run.ended(DURATION_S, robot),
         operator_peak_n=operator_peak_n(run.rows),
         operator_rms_n=float(np.sqrt(np.mean(hand * hand))),
@@ -235,7 +235,7 @@ def run_trial(
 
 
 def _torque_step_nm(run: CaseRun, from_ns: int) -> float:
-    """Return `LatencyResult.torque_step_nm`."""
+    """Return `_LatencyResult.torque_step_nm`."""
     largest = 0.0
     for module in MODULES:
         states = [m for name, m in run.messages if name == module and isinstance(m, JointState)]
@@ -460,7 +460,7 @@ STUDY: Final = Study[LatencyTrial](
     cases=lambda flags, _robot: partial(trial_of, grid_of(flags), flags.seed),
     decided_by=("delay", "jitter", "loss", "control"),
     row=row_of,
-    figures=LatencyResult,
+    figures=_LatencyResult,
     trial=run_trial,
     report=report,
     draw=draw,

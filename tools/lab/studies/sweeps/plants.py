@@ -39,20 +39,20 @@ class _ErrorRange(Section, frozen=True):
     scale: Literal["linear", "log"] = "linear"
 
 
-class Ranges(Section, frozen=True):
+class _Ranges(Section, frozen=True):
     """The whole file."""
 
     error: tuple[_ErrorRange, ...]
 
 
 @cache
-def shipped() -> Ranges:
+def shipped() -> _Ranges:
     """Return the ranges of this checkout.
 
     Raises:
         ConfigError: a range makes no sense.
     """
-    ranges = read_toml(RANGES_FILE, Ranges)
+    ranges = read_toml(RANGES_FILE, _Ranges)
     for row in ranges.error:
         if not row.low < row.high or (row.scale == "log" and row.low <= 0.0):
             found = f"{row.low:g} to {row.high:g}"

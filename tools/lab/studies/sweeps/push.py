@@ -84,7 +84,7 @@ class PushTrial(msgspec.Struct, frozen=True):
         return self.plant
 
 
-class PushResult(msgspec.Struct, frozen=True, kw_only=True):
+class _PushResult(msgspec.Struct, frozen=True, kw_only=True):
     """How hard a push is stood."""
 
     stood_n: float
@@ -100,7 +100,7 @@ class PushResult(msgspec.Struct, frozen=True, kw_only=True):
     """What soles and motors bear in this pose if the push lasts, whatever the control."""
 
 
-def run_trial(trial: PushTrial, robot: RobotConfig, _observer: Observer = NOBODY) -> PushResult:
+def run_trial(trial: PushTrial, robot: RobotConfig, _observer: Observer = NOBODY) -> _PushResult:
     """Find the hardest push by bisection.
 
     Raises:
@@ -117,7 +117,7 @@ def run_trial(trial: PushTrial, robot: RobotConfig, _observer: Observer = NOBODY
     limits = limits_of(trial, robot)
     trips = trial.angle_deg % 180 != 0
     held = limits.led if trial.mode == "led" and not trips else limits.held
-    return PushResult(
+    return _PushResult(
         stood_n=stood,
         fell_n=fell if fell <= FORCE_MAX_N else None,
         held_limit_n=held.force_n,
@@ -273,7 +273,7 @@ STUDY: Final = Study[PushTrial](
     cases=lambda flags, _robot: trials_of(flags).__getitem__,
     decided_by=("plant", "pose", "angle", "duration"),
     row=row_of,
-    figures=PushResult,
+    figures=_PushResult,
     trial=run_trial,
     report=report,
     draw=draw,

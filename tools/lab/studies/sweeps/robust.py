@@ -26,8 +26,10 @@ from tools.lab.studies.sweeps.figures import (
     Ended,
     Ending,
     Observer,
+    ReactingPerson,
     com_max_mm,
     event_steps_nm,
+    ignore,
     operator_peak_n,
     parted,
     run_fleet,
@@ -72,6 +74,8 @@ class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
     kill_s: float
     delay_ms: float
     pushes: tuple[Push, ...]
+    reacts_s: float | None = None
+    """Time in which the person stops leading once the robot holds; None: they lead on."""
 
     def true_plant(self) -> PlantConfig:
         """Return the trial's simulated robot."""
@@ -102,7 +106,7 @@ class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class RobustResult(Ended, frozen=True, kw_only=True):
+class _RobustResult(Ended, frozen=True, kw_only=True):
     """The figures of a trial; None where there is nothing to measure."""
 
     operator_peak_n: float | None = None
@@ -117,7 +121,12 @@ class RobustResult(Ended, frozen=True, kw_only=True):
 
 
 def draw(
-    pushes: PushRange, seed: int, number: int, beyond: float = 1.0, slope_deg: float = 0.0
+    pushes: PushRange,
+    seed: int,
+    number: int,
+    beyond: float = 1.0,
+    slope_deg: float = 0.0,
+    reacts_s: float | None = None,
 ) -> RobustTrial:
     """Return one trial; no other trial has to be drawn for it."""
     dice = random.Random(f"robust {seed} {number}")
@@ -136,19 +145,21 @@ def draw(
         kill_s=kill,
         delay_ms=uniform(dice, 0.5, DELAY_MAX_MS),
         pushes=(led, held),
+        reacts_s=reacts_s,
     )
 
 
-def run_trial(trial: RobustTrial, robot: RobotConfig, observer: Observer = NOBODY) -> RobustResult:
+def run_trial(trial: RobustTrial, robot: RobotConfig, observer: Observer = NOBODY) -> _RobustResult:
     """Run a trial to its end or to the fall, and measure it."""
     network, end_s = Impairment(delay_ms=trial.delay_ms), trial.scenario(robot).duration
-    run = run_fleet(trial, robot, observer, network, seed=trial.number)
+    each = ignore if trial.reacts_s is None else ReactingPerson(trial.reacts_s)
+    run = run_fleet(trial, robot, observer, network, seed=trial.number, each=each)
     if not run.began:
-        return RobustResult(**run.ended(end_s, robot))
+        return _RobustResult(**run.ended(end_s, robot))
     led = [row for row in run.rows if row.scenario_s < trial.kill_s]
     held = [row for row in run.rows if row.scenario_s >= trial.kill_s]
     events = [event for _, event in run.events if run.rows[0].t_ns <= event.t_ns]
-    return RobustResult(
+    return _RobustResult(
         **run.ended(end_s, robot),
         operator_peak_n=operator_peak_n(led),
         com_led_max_mm=com_max_mm(led),
@@ -183,6 +194,7 @@ xrl study robust
 xrl study robust --n 500 --out out/robust
 xrl study robust --beyond 2
 xrl study robust --slope 5 --imu
+xrl study robust --reacts 0.3
 xrl study robust --only 17 --out out/trial17
 """
 
@@ -197,6 +209,9 @@ class RobustStudyFlags(StudyFlags, ImuFlags, PushFlags):
     slope: Annotated[float, Range(0.0, SLOPE_MAX_DEG, "degrees"), Arg(metavar="DEG")] = 0.0
     """a floor that slopes by DEG degrees in a drawn direction (default: up to 1 degree, as in the
     ranges)"""
+    reacts: Annotated[float | None, Range(0.0, 5.0, "s"), Arg(metavar="S")] = None
+    """the person stops leading S seconds after the robot went to HOLD, as told by `xrl cue`
+    (default: the hand leads on)"""
 
     def check(self) -> None:
         """Refuse ranges that cannot be drawn from."""
@@ -257,7 +272,7 @@ def draw_excursions(finished: StudyRun) -> Picture:
 
 def _cases(flags: RobustStudyFlags, robot: RobotConfig) -> Callable[[int], RobustTrial]:
     pushes = PushRange(robot, flags.push)
-    return lambda number: draw(pushes, flags.seed, number, flags.beyond, flags.slope)
+    return lambda number: draw(pushes, flags.seed, number, flags.beyond, flags.slope, flags.reacts)
 
 
 STUDY: Final = Study[RobustTrial](
@@ -266,9 +281,9 @@ STUDY: Final = Study[RobustTrial](
     table="trials.csv",
     load=lambda flags: experiment.load_robot(flags.config, imu=flags.imu),
     cases=_cases,
-    decided_by=("beyond", "slope", "push"),
+    decided_by=("beyond", "slope", "push", "reacts"),
     row=row_of,
-    figures=RobustResult,
+    figures=_RobustResult,
     trial=run_trial,
     report=report,
     draw=draw_excursions,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import random
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -22,6 +23,7 @@ from tools.lab.studies.sweeps.figures import Ending, Observer
 from tools.lab.studies.sweeps.plants import PushRange
 from tools.lab.studies.sweeps.robust import KINDS, draw, row_of, run_trial
 from tools.output import save_figure
+from tools.sim.lockstep import Lockstep
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +87,22 @@ def test_a_change_of_mode_after_the_fall_does_not_count(
     )  # fmt: skip
     assert run.ended(9.0, robot)["fell_at_s"] == 2.0
     assert [event.t_ns for _, event in run.events] == [NS_PER_S // 2]
+
+
+def test_a_person_who_reacts_stops_leading_where_the_robot_is_some_time_after_it_holds() -> None:
+    fleet = SimpleNamespace(
+        controllers=[SimpleNamespace(failsafe=SimpleNamespace(mode=Mode.TRACK))]
+    )
+    led: list[tuple[float, float]] = []
+    person = figures.ReactingPerson(0.3)
+    for tick in range(-100, 300):
+        t_s = tick / 100
+        if t_s >= 1.0:
+            fleet.controllers[0].failsafe.mode = Mode.HOLD
+        fleet.lead = lambda hand, t_s=t_s: led.append((t_s, hand.height))
+        row = msgspec.structs.replace(AT_REST, scenario_s=t_s, torso=(0.0, 0.0, 2.0 - t_s))
+        person(cast(Lockstep, fleet), row)
+    assert led == [(1.3, pytest.approx(0.7))]
 
 
 @pytest.mark.parametrize("cause", ["body.com_offset", "drive.lag_s", "floor.slope"])

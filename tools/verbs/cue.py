@@ -1,0 +1,129 @@
+"""`xrl cue`: tells the wearer at once when the robot stops following them, and when it does again.
+
+A person who leads on against a robot that holds tips it: docs/results.md#a-hand-that-leads-on. The
+terminal's bell rings at each change, or a command of your own sounds, lights or shakes something.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Sequence
+from enum import Enum
+from typing import Annotated, Final
+
+from shared.bus import topics
+from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus
+from shared.bus.session import Latest, Session, open_session
+from shared.exceptions import FleetError
+from shared.joints import MODULES
+from shared.process import StopFlag
+from tools.flags import RunDirFlags, positional
+from tools.fleet.supervise import SupervisedFleet
+from tools.terminal import Console
+
+POLL_S: Final = 0.005
+SILENT_S: Final = 0.5
+"""A module or planner that is silent for this time counts as not following."""
+
+
+class Cue(Enum):
+    """What the wearer is told; the value is the command's argument."""
+
+    FOLLOWS = "follows"
+    """The planner leads, and all six modules track: the robot follows the hand."""
+    HOLDS = "holds"
+    """It stands where it is, whatever the hand does. Stop leading."""
+    SINKS = "sinks"
+    """A module damps or is disarmed: the robot goes down."""
+    FALLEN = "fallen"
+
+
+def cue_of(modes: Sequence[int | None], planner: int | None) -> Cue:
+    """Return what to tell the wearer.
+
+    Args:
+        modes: `Mode` of each module; None if it is silent.
+        planner: `PlannerMode`; None if it is silent.
+    """
+    if planner == PlannerMode.FALLEN:
+        return Cue.FALLEN
+    if any(mode not in (None, Mode.HOLD, Mode.TRACK) for mode in modes):
+        return Cue.SINKS
+    leads = planner == PlannerMode.LEADING and all(mode == Mode.TRACK for mode in modes)
+    return Cue.FOLLOWS if leads else Cue.HOLDS
+
+
+EXAMPLES: Final = """
+xrl cue                          # ring the terminal's bell at each change
+xrl cue play-for-wearer.sh       # run: play-for-wearer.sh holds, follows, sinks or fallen
+xrl cue -- spd-say --rate 50     # say it
+"""
+
+
+class CueFlags(RunDirFlags):
+    """What makes the sound."""
+
+    command: Annotated[tuple[str, ...], positional("COMMAND")] = ()
+    """run at each change with follows, holds, sinks or fallen as its last argument; without one
+    the terminal's bell rings"""
+
+
+class _Heard:
+    """The newest message of each sender, and None once it is silent."""
+
+    def __init__(self, session: Session) -> None:
+        self._latest: dict[str, Latest[JointState] | Latest[PlannerStatus]] = {
+            module: session.latest_in_batch(topics.JOINT_STATE, JointState, module)
+            for module in MODULES
+        }
+        self._latest["planner"] = session.latest_in_batch(topics.PLANNER_STATUS, PlannerStatus)
+        self._seen: dict[str, tuple[float, int]] = {}
+
+    def look(self) -> Cue:
+        """Return what holds now."""
+        now = time.monotonic()
+        for name, latest in self._latest.items():
+            message = latest.take()
+            if message is not None:
+                self._seen[name] = now, message.mode
+        modes = {name: mode for name, (heard, mode) in self._seen.items() if now - heard < SILENT_S}
+        return cue_of([modes.get(module) for module in MODULES], modes.get("planner"))
+
+    @property
+    def complete(self) -> bool:
+        """True if every sender was heard once."""
+        return len(self._seen) == len(self._latest)
+
+
+def run(flags: CueFlags) -> int:
+    """Tell each change until Ctrl-C."""
+    fleet = SupervisedFleet.attach(flags.run_dir)
+    console, stop = Console(), StopFlag()
+    told: Cue | None = None
+    sounding: subprocess.Popen[bytes] | None = None
+    with open_session(fleet.manifest.robot(), "cue", fleet.run.path) as session:
+        watched, began = _Heard(session), time.monotonic()
+        while not stop:
+            time.sleep(POLL_S)
+            now = watched.look()
+            if told is None and not watched.complete and time.monotonic() - began < SILENT_S:
+                continue  # the first messages are on their way
+            if now is not told:
+                told = now
+                console.print(now.value)
+                if not flags.command:
+                    console.bell()
+                if sounding is not None and sounding.poll() is None:
+                    sounding.terminate()
+                sounding = _start([*flags.command, now.value]) if flags.command else None
+    if sounding is not None:
+        sounding.wait()
+    return 0
+
+
+def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
+    try:
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    except OSError as error:
+        raise FleetError(f"{command[0]}: cannot be run: {error.strerror}") from None
