@@ -42,13 +42,17 @@ def sinks(rows: list[SimTruth]) -> float:
 def test_it_carries_a_person_who_rests_and_lifts_nobody_who_gets_up(
     force: float, ramp_s: float
 ) -> None:
-    """With the height open it sank by 13 cm, and carried a twentieth."""
+    """With the height open it sank by 13 cm, and carried a twentieth.
+
+    Every command is inside the envelope that the gains of a led robot were certified with.
+    """
     outcome = run(PARKED, crouch(rest(force, 5.0, ramp_s), duration=AT_S + 7.0))
     assert outcome.stood
+    assert outcome.believed
     rests = between(outcome, AT_S, AT_S + 4.5)
     borne = [row.load_n - row.operator_force[2] for row in rests if row.scenario_s > AT_S + 3.5]
     assert np.mean(borne) > 0.85 * force
-    assert sinks(rests) < 0.012
+    assert sinks(rests) < 0.01
     after = between(outcome, AT_S + 5.0, AT_S + 7.0)
     assert max(abs(row.operator_force[2]) for row in after) < 40.0
 
