@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
-from unittest import mock
 
 from services.joint.failsafe import TRANSITIONS, Event
 from shared.arguments import FlagParser
@@ -36,7 +35,8 @@ _MODES: Final = """\
 The joint service acts on one event a cycle, the gravest first (the table's order). An event that a
 mode does not list changes nothing. The reasons behind the machine: [](../architecture.md#modes).
 """
-_WIDTH: Final = "96"
+_SHARED_BY: Final = 2
+"""A flag that as many verbs have with the same meaning is described once."""
 _VERBS: Final = """\
 # Verbs
 
@@ -89,24 +89,49 @@ def _after(mode: Mode, event: Event) -> str:
 
 
 def _verbs_page() -> Iterator[str]:
-    """Yield the page of the command line: each verb's own help."""
-    with mock.patch.dict(os.environ, COLUMNS=_WIDTH):  # argparse wraps by it
-        helps = list(_helps(whole_parser()))
+    """Yield the page of the command line: each verb's flags and examples."""
+    parsers = dict(_parsers(whole_parser()))
+    flags = {name: dict(_flags(parser)) for name, parser in parsers.items()}
+    count = Counter(row for rows in flags.values() for row in rows.items())
+    shared = {row: None for row in count if count[row] >= _SHARED_BY}
     rows = ((f"[`{verb.name}`](#xrl-{verb.name.replace(' ', '-')})", verb.help) for verb in VERBS)
     yield _VERBS
     yield from table("verb | what it does", rows)
-    for name, text in helps:
-        yield f"\n## xrl {name}\n\n```text\n{text.rstrip()}\n```"
+    yield "\n## Flags of several verbs\n"
+    yield from table("flag | meaning", shared)
+    for name, found in flags.items():
+        own = [row for row in found.items() if row not in shared]
+        also = [f"{flag.split()[0].rstrip('`')}`" for flag, _ in found.items() & shared.keys()]
+        yield f"\n## xrl {name}\n"
+        yield " ".join((parsers[name].description or "").split()) + "\n"
+        if own:
+            yield from table("flag | meaning", own)
+            yield ""
+        if also:
+            yield f"Also {', '.join(sorted(also))}.\n"
+        lines = (parsers[name].epilog or "").splitlines()[1:]
+        if lines:
+            yield "\n".join(["```sh", *(line.strip() for line in lines), "```"])
 
 
-def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
-    """Yield name and help of every verb below a parser."""
+def _flags(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
+    """Yield a parser's flags and arguments as its help names them, and their meaning."""
+    formatter = parser._get_formatter()  # noqa: SLF001
+    for action in parser._actions:  # noqa: SLF001
+        hidden = not action.help or argparse.SUPPRESS in (action.help, action.dest)
+        if not hidden and action.dest != "help":
+            invocation = formatter._format_action_invocation(action)  # noqa: SLF001
+            yield one_line(f"`{invocation}`"), one_line(formatter._expand_help(action))  # noqa: SLF001
+
+
+def _parsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """Yield name and parser of every verb below a parser."""
     actions = parser._subparsers._group_actions if parser._subparsers else []  # noqa: SLF001
     choices: list[Any] = [action.choices for action in actions]  # of sub-parsers it is a dictionary
     for found in choices:
         for below in found.values():
-            yield below.prog.removeprefix("xrl "), below.format_help()
-            yield from _helps(below)
+            yield below.prog.removeprefix("xrl "), below
+            yield from _parsers(below)
 
 
 PAGES: Final[dict[str, Callable[[], Iterable[str]]]] = {

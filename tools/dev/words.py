@@ -1,0 +1,70 @@
+"""`python -m tools.dev.words`: finds words that a colleague would not say, with what to write.
+
+Looks through README, docs, and the docstrings, comments and texts of services, shared and tools.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from shared.exceptions import FAULT_EXIT_CODE
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+PATTERNS: Final = (
+    (r"\bnobody's\b|\bof somebody's own\b", "name the owner, or say that there is none"),
+    (r"\bnobody knows\b|\bwhich nobody\b|\bleads nobody\b", "is unknown; does not lead"),
+    (r"\bwhoever\b", "name the person or the process"),
+    (r"\bso (long|many|much|often)\b(?! (as|that)\b)", "a number, a maximum, a timeout"),
+    (r"\bnever so\b|\bno longer than so\b", "at most N"),
+    (r"\bfor ever\b", "forever, or say until when"),
+    (r"\bat the (most|least)\b", "at most, at least"),
+    (r"\b(is|are) no more\b|\bno more$", "has ended; no longer"),
+    (r"\bif (it|there) is none\b|\bof none\b|\bhas none\b", "None if ...; has no X"),
+    (r"\bgoes on\b", "continues"),
+    (r"\bstands in (the|a|its|this|that)\b", "is in"),
+    (r"\b(is|are) to be\b", "must be, should be"),
+    (r"\bin vain\b", "without success"),
+    (r'"""(Of|What|How|Whether|Who|That|Which) ', "a noun phrase, or an imperative"),
+    (r"\bwhat (it|there) is to\b|\bwhat may not\b", "name the thing"),
+    (r"\bkeeps? (silence|still) about\b|\bis silent about\b", "does not report"),
+)
+"""Regular expression, and what to write instead; upper and lower case are the same."""
+PLACES: Final = ("README.md", "CONTRIBUTING.md", "docs/*.md", "services", "shared", "tools")
+_COMPILED: Final = tuple((re.compile(found, re.IGNORECASE), right) for found, right in PATTERNS)
+
+
+def findings(text: str) -> Iterator[tuple[int, str, str]]:
+    """Yield line number, the words found and what to write, of a text."""
+    for number, line in enumerate(text.splitlines(), 1):
+        for pattern, right in _COMPILED:
+            found = pattern.search(line)
+            if found:
+                yield number, found[0], right
+
+
+def files() -> Iterator[Path]:
+    """Yield every file that is looked through."""
+    for place in PLACES:
+        path = ROOT / place
+        yield from sorted(path.rglob("*.py") if path.is_dir() else ROOT.glob(place))
+
+
+def main() -> int:
+    """Print every finding; a fault if there is one."""
+    count = 0
+    for path in files():
+        if path == Path(__file__).resolve():
+            continue
+        for number, found, right in findings(path.read_text(encoding="utf-8")):
+            count += 1
+            print(f"{path.relative_to(ROOT)}:{number}: {found.strip()!r}; write: {right}")
+    print(f"{count} findings" if count else "words: none of the patterns is found")
+    return FAULT_EXIT_CODE if count else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
