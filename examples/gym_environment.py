@@ -38,7 +38,7 @@ class Residual:
     def step(self, seen: Observation) -> Action:
         """Return the law's action with the offset of this step."""
         self.reset(seen)
-        law, (offset, torque) = Action.of(seen.law), self.action.reshape(2, 12)
+        law, (offset, torque) = Action.from_law(seen.law), self.action.reshape(2, 12)
         return law._replace(
             q_ref=law.q_ref + OFFSET * offset, tau_coupled=law.tau_coupled + TORQUE * torque
         )

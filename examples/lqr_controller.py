@@ -65,4 +65,4 @@ class Controller:
         wrench[list(CLOSED)] -= (seen.T.T @ local)[list(CLOSED)]
         fraction = 1.0 - math.exp(-2.0 * math.pi * LOW_PASS_HZ * seen.dt)
         self._coupled += fraction * (seen.J.T @ wrench - self._coupled)
-        return Action.of(law)._replace(tau_coupled=self._coupled.copy())
+        return Action.from_law(law)._replace(tau_coupled=self._coupled.copy())

@@ -10,7 +10,7 @@ from typing import Any
 class FlagParser(argparse.ArgumentParser):
     """Parser that refuses abbreviated and unknown flags, and suggests the closest flag.
 
-    With argparse's abbreviations `xrl down --li` was `--limp`, which lets a standing robot fall.
+    With argparse's abbreviations `xrl down --li` means `--limp`, which lets a standing robot fall.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -26,10 +26,10 @@ class FlagParser(argparse.ArgumentParser):
     def _refusal(self, unknown: list[str]) -> str:
         flags = [word.partition("=")[0] for word in unknown if word.startswith("-")]
         if not flags:
-            return f"unexpected: {' '.join(unknown)[:80]}"
+            return f"unexpected argument: {' '.join(unknown)[:80]}"
         known = {flag.lstrip("-"): flag for flag in self._option_string_actions}
         asked = flags[0].lstrip("-")
         near = [name for name in known if name.startswith(asked)]
         near = near or difflib.get_close_matches(asked, known, n=1)
         hint = f"did you mean {' or '.join(known[name] for name in near)}? " if near else ""
-        return f"no flag {flags[0][:40]!r}; {hint}`--help` lists them"
+        return f"unknown flag {flags[0][:40]!r}; {hint}`--help` lists all flags"

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, whatever ends their writer: how results are written."""
+"""Files that exist whole or not at all, however their writer ends; all results are written so."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import BinaryIO
 def atomic_file(
     path: Path, *, private: bool = False, exclusive: bool = False, lasting: bool = False
 ) -> Iterator[BinaryIO]:
-    """Yield a file beside a path, which takes its place when the block ends well.
+    """Yield a file beside a path; it replaces the path when the block succeeds.
 
-    Otherwise it is removed and what was there stays. A kill leaves `.NAME.part`, which the next try
+    Otherwise it is removed and the old file stays. A kill leaves `.NAME.part`, which the next try
     replaces. `private`: for this user alone; `exclusive`: replace no file; `lasting`: return when
     it is on the disk. Raises OSError, whose `filename` is the path, if it cannot be written or
     exists.

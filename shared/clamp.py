@@ -1,4 +1,4 @@
-"""Limits a number to a range. Pure."""
+"""Limit a number to a range. Pure."""
 
 from __future__ import annotations
 

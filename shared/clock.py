@@ -1,9 +1,9 @@
 """The fleet's clock, in one place so that laws never read it.
 
 CLOCK_MONOTONIC, one for all processes of a host. A simulated fleet may run in slow motion
-(`keep_pace`): on cores too slow for ten services in real time, the clock of all of them runs
-slower. Control, physics and log are those of a faster machine. Only code that waits needs to know
-(`machine_s`, `sleep_until`).
+(`keep_pace`): if the cores are too slow for ten services in real time, the clock of all of them
+runs slower. Control, physics and log are then as on a faster machine. Only code that waits needs to
+know the pace (`machine_s`, `sleep_until`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ NS_PER_MS = 1_000_000
 NS_PER_US = 1_000
 
 PACE_FILE = "pace"
-"""In the live directory of a fleet in slow motion."""
+"""Name of a file in the live directory of a fleet in slow motion."""
 
 _pace = 1.0
 
@@ -38,12 +38,12 @@ def sleep_until(deadline_ns: int) -> None:
 
 
 def machine_s(fleet_s: float) -> float:
-    """Return how long seconds of the fleet's clock last on the machine's: to wait for."""
+    """Convert seconds of the fleet's clock into seconds of the machine's, for waits."""
     return fleet_s / _pace
 
 
 def pace() -> float:
-    """Return how fast the fleet's clock goes, in seconds a second."""
+    """Return the fleet's seconds per second of the machine."""
     return _pace
 
 
@@ -64,5 +64,7 @@ def keep_pace(run_dir: Path) -> None:
     except ValueError:
         found = 0.0
     if not 0.0 < found <= 1.0:
-        raise FleetError(f"{path}: {text.strip()!r} is no pace; above 0 and up to 1 is right")
+        raise FleetError(
+            f"{path}: {text.strip()!r} is not a valid pace; it must be above 0 and at most 1"
+        )
     _pace = found

@@ -23,23 +23,23 @@ class XrlError(Exception):
 
 
 DECLINED_EXIT_CODE: Final = XrlError.exit_code
-"""Exit code of a verb that asked a person, who said no."""
+"""Exit code of a verb whose question a person answered with no."""
 FELL_EXIT_CODE: Final = 1
 """Exit code of a run in which a robot fell, or is about to at its end; of nothing else."""
 FAULT_EXIT_CODE: Final = 3
-"""Exit code of a check that found something not as it should be: a fault, a difference, nothing."""
+"""Exit code of a check that found a fault or a difference, or found nothing."""
 BUG_EXIT_CODE: Final = 70
-"""Exit code of a process that an unforeseen exception ended: a fault of this project (EX_SOFTWARE
-of sysexits.h). Python's own would be `FELL_EXIT_CODE`."""
+"""Exit code of a process that an unforeseen exception ended: a bug of this project (EX_SOFTWARE of
+sysexits.h). Python's own would be `FELL_EXIT_CODE`."""
 HUNG_UP_EXIT_CODE: Final = 128 + signal.SIGHUP
 """Exit code of a verb whose terminal is gone, as after a dropped ssh session."""
 
 
 class ConfigError(XrlError):
-    """A configuration or scenario file holds something that cannot be used."""
+    """A configuration or scenario file is invalid."""
 
     def __init__(self, file: str, key: str, found: str, expected: str) -> None:
-        """Name the file, the dotted key, what stands there and what would be right."""
+        """Take the file, the dotted key, the found and the right value."""
         super().__init__(f"{file}: {key}: {found}; {expected}")
         self.file = file
         self.key = key
@@ -52,7 +52,7 @@ class BusError(XrlError):
 
 
 class EncodeError(BusError):
-    """A message holds a value that JSON has no form for; it was not sent."""
+    """A message holds a value that JSON cannot express; it was not sent."""
 
 
 class NonFiniteError(EncodeError):
@@ -68,7 +68,7 @@ class FleetError(XrlError):
 
 
 class HungUpError(FleetError):
-    """The terminal is gone, from which a person led the robot."""
+    """The terminal from which a person led the robot is gone."""
 
     exit_code = HUNG_UP_EXIT_CODE
 
@@ -82,11 +82,11 @@ class MissingPackageError(RunError):
 
 
 _REMEDIES: Final = {
-    errno.ENOSPC: "a disk is full: that of the output, /tmp or /dev/shm",
-    errno.EDQUOT: "this user's share of a disk is used up",
+    errno.ENOSPC: "a disk is full: check the output's disk, /tmp and /dev/shm",
+    errno.EDQUOT: "this user's disk quota is used up",
     errno.EROFS: "the disk is read-only: find out why (`dmesg`), then remount or replace it",
-    errno.EMFILE: "this process may open no more files: `ulimit -n`",
-    errno.ENOMEM: "the machine has no memory left",
+    errno.EMFILE: "this process cannot open more files: raise `ulimit -n`",
+    errno.ENOMEM: "the machine is out of memory",
 }
 
 
@@ -96,7 +96,7 @@ def os_error_in_words(error: OSError) -> str:
     name = "" if error.filename is None else f"{str(error.filename)[:200]}: "
     remedy = _REMEDIES.get(error.errno or 0, "")
     if error.errno == errno.ENOENT and error.filename is None and not _has_folder():
-        remedy = "the folder in which this was started has been removed: cd to another"
+        remedy = "the working directory was removed: change to another"
     return f"{name}{said}{'; ' if remedy else ''}{remedy}"
 
 

@@ -1,8 +1,8 @@
-"""The optional packages: which extra of pyproject.toml brings each, and how its absence is said.
+"""Optional packages: the extra of pyproject.toml that brings each, and the error without it.
 
 `pip install xrl` brings what a robot in service needs. A verb of an owner's desk calls `require`
-before it begins; a module that uses such a package takes it by `late`, so that it can be imported
-without the package.
+before it begins. A module that uses such a package imports it by `late`, so that the module can be
+imported without the package.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ ON_ROBOTS: Final = frozenset({"ros2", "usb"})
 def require(extra: str, otherwise: str = "") -> None:
     """Import the packages of an extra: after an upgrade in place one may be there and fail.
 
-    `otherwise` is what serves without them. Raises MissingPackageError if one is not installed or
-    cannot be imported.
+    `otherwise` names the alternative without them. Raises MissingPackageError if one is not
+    installed or cannot be imported.
     """
     missing = [name for name in EXTRAS[extra] if not _is_there(name)]
     if missing:
@@ -59,7 +59,7 @@ def is_installed(extra: str) -> bool:
 
 
 def _is_there(package: str) -> bool:
-    """Return True for a package; deploy is on the path too, and its folder `plants` is none."""
+    """Return True if a package is installed; `plants` of deploy, also on the path, is not one."""
     found = importlib.util.find_spec(package)
     if found is None or found.origin is not None:
         return found is not None
@@ -83,7 +83,7 @@ def _error(trouble: str, extra: str, them: str, otherwise: str) -> MissingPackag
     else:  # in an environment of uvx or pipx
         command = f"install 'xrl[{extra}]' in place of 'xrl'"
     return MissingPackageError(
-        f"{trouble}; the extra `{extra}` brings {them}: "
+        f"{trouble}; the extra `{extra}` includes {them}: "
         f"{command}{'; or ' if otherwise else ''}{otherwise}"
     )
 
@@ -104,7 +104,7 @@ def _imported(module: str, otherwise: str = "") -> ModuleType:
         if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
             raise _missing_package(extra, [package], otherwise) from None
         said = " ".join(str(error).split()) or type(error).__name__
-        trouble = f"{package} is installed and cannot be imported: {said}"
+        trouble = f"{package} is installed but cannot be imported: {said}"
         raise _error(trouble, extra, "it", otherwise) from error
 
 
@@ -117,7 +117,7 @@ def late(module: str) -> Any:
 
 
 class _LateModule:
-    """Passes on what is asked of it; each name is looked up once."""
+    """Stand-in for a module; looks up each name once."""
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -129,7 +129,7 @@ class _LateModule:
 
 
 def libusb_fix() -> str:
-    """Return the command that brings libusb-1.0.so.0, which the `odrive` package loads."""
+    """Return the command that installs libusb-1.0.so.0, which the `odrive` package loads."""
     if shutil.which("apt-get"):
         return "`sudo apt-get install libusb-1.0-0`"
     if shutil.which("dnf"):

@@ -41,7 +41,7 @@ STATES: Final = tuple(f"{module}->planner" for module in MODULES)
 WRENCHES: Final = "harness->planner"
 ATTITUDES: Final = "imu->planner"
 DIRECTIONS: Final = (*COMMANDS, *STATES, WRENCHES, ATTITUDES)
-"""Every direction that control or states pass."""
+"""Every direction that can be impaired."""
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "planner->joints": COMMANDS,
@@ -56,18 +56,20 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def endpoint_through(pair: Pair) -> str:
-    """Return where the network proxy listens for a pair: what `bus.endpoints` is without it."""
+    """Return the network proxy's endpoint for a pair, used instead of that in `bus.endpoints`."""
     return f"unixsock-stream/{{run}}/through-{pair.dials}-{pair.listens}.zenoh"
 
 
 def directions_of(link: str, file: str = "--link", key: str = "link") -> tuple[str, ...]:
     """Return the directions that a name of `DIRECTIONS` or `GROUPS` stands for.
 
-    `file` and `key` say where it stands in the ConfigError for a name of none.
+    `file` and `key` name the source of an unknown name in the ConfigError.
     """
     if link in GROUPS:
         return GROUPS[link]
     if link in DIRECTIONS:
         return (link,)
-    right = f"one of {', '.join(GROUPS)}, planner->MODULE, MODULE->planner, {WRENCHES}, {ATTITUDES}"
+    right = (
+        f"use one of {', '.join(GROUPS)}, planner->MODULE, MODULE->planner, {WRENCHES}, {ATTITUDES}"
+    )
     raise ConfigError(file, key, repr(link), right)

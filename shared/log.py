@@ -10,7 +10,7 @@ import stat
 def setup(service: str) -> logging.Logger:
     """Send this process's log lines to stderr with its name and return its logger.
 
-    A line that a pipe does not take at once is lost: a supervisor that hangs holds nobody up.
+    A line that a pipe does not take at once is lost, so that a hung supervisor blocks nobody.
     """
     if stat.S_ISFIFO(os.fstat(2).st_mode):
         os.set_blocking(2, False)

@@ -1,8 +1,8 @@
-"""Where this project's own files are, which robot file is meant, and who the user is.
+"""Locations of this project's own files, the robot file in use, and the user.
 
-In a checkout its data files lie in `deploy/`. A wheel has the same files in `shared/files/`
-(`deploy/build_hook.py`); then there is no source tree around the packages, and no git. The user may
-have neither a name nor a home, as a container's.
+In a checkout the data files are in `deploy/`. A wheel has the same files in `shared/files/`
+(`deploy/build_hook.py`), without a source tree around the packages and without git. The user may
+have neither a name nor a home, for example in a container.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ DEFAULT_CONFIG: Final = FILES / "robot.toml"
 SCENARIOS: Final = FILES / "scenarios"
 
 ROBOT_FILE: Final = "robot.toml"
-"""Name of a robot file that is taken from the working directory without `--config`."""
+"""Name of the robot file that is used from the working directory without `--config`."""
 NOT_NAMED: Final = "\0"
 """Default of `--config` on a command line: text that no argument can be."""
-HELP: Final = f"robot file (default: {ROBOT_FILE} of the working directory, else as shipped)"
+HELP: Final = f"robot file (default: {ROBOT_FILE} in the working directory, else the shipped one)"
 
 
 def need_checkout(what: str) -> None:
-    """Refuse what needs the source tree or git: RunError where XRL runs from an installed wheel."""
+    """Raise RunError if XRL runs from an installed wheel: `what` needs the source tree or git."""
     if not IS_CHECKOUT:
         raise RunError(
-            f"{what} needs a checkout of XRL, and this is a wheel installed in {CHECKOUT}; "
+            f"{what} needs a checkout of XRL, but this is a wheel installed in {CHECKOUT}; "
             "run it in a clone of the repository, after ./deploy/install"
         )
 
@@ -46,14 +46,14 @@ def refuse_shipped(path: Path) -> None:
     """Refuse to write into the files of an installed wheel: the next install would replace them."""
     if not IS_CHECKOUT and path.resolve().is_relative_to(FILES):
         raise RunError(
-            f"{path}: is the robot as shipped, and stays so; `xrl new DIR` makes one to be changed"
+            f"{path}: is the shipped robot, which must not change; make your own with `xrl new DIR`"
         )
 
 
 def robot_file(given: Path | None = None) -> Path:
-    """Return which robot file is meant; says on stderr which one it found.
+    """Return the robot file in use; report on stderr one found in the working directory.
 
-    What `--config` gave as it is, else `robot.toml` of the working directory (absolute), else the
+    The file given by `--config`, else `robot.toml` of the working directory (absolute), else the
     shipped one. Raises ConfigError as `robot_file_here`.
     """
     found = given or robot_file_here()
@@ -65,11 +65,10 @@ def robot_file(given: Path | None = None) -> Path:
 
 
 def robot_file_here() -> Path | None:
-    """Return `robot.toml` of the working directory, absolute; None if it is not there or shipped.
+    """Return `robot.toml` of the working directory, absolute; None if it is missing or shipped.
 
-    A link that leads nowhere counts: the shipped robot must not stand in for a file that is lost.
-    Raises ConfigError if it belongs to another user, who could choose the robot for whoever works
-    here.
+    A dangling link counts: the shipped robot must not replace a lost file. Raises ConfigError if it
+    belongs to another user, who could choose the robot for anyone who works here.
     """
     if not os.path.lexists(ROBOT_FILE):
         return None
@@ -78,7 +77,7 @@ def robot_file_here() -> Path | None:
         if path.samefile(DEFAULT_CONFIG):
             return None
         if path.stat().st_uid not in (os.getuid(), 0):
-            right = f"--config {ROBOT_FILE} takes it, or work in another directory"
+            right = f"use it with --config {ROBOT_FILE}, or work in another directory"
             raise ConfigError(str(path), "(file)", "belongs to another user", right)
     return path
 
@@ -89,7 +88,7 @@ def config_argument(text: str) -> Path:
 
 
 def user_name() -> str:
-    """Return the user's name, or `uid N` where the system knows none; never raises."""
+    """Return the user's name, or `uid N` if it is unknown; never raises."""
     try:
         name = getpass.getuser()
     except (KeyError, OSError, ImportError):
@@ -104,5 +103,5 @@ def in_home(path: str | Path) -> Path:
         return Path(path).expanduser()
     except RuntimeError:
         raise XrlError(
-            f"{path}: {user_name()} knows no such home directory; set HOME, or write a whole path"
+            f"{path}: {user_name()} has no such home directory; set HOME, or use an absolute path"
         ) from None

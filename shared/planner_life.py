@@ -1,10 +1,10 @@
-"""The planner's process, as the joint services on its host see it: dead at once, not 50 ms later.
+"""Death of the planner's process, seen at once by the joint services of its host.
 
 The kernel marks a word of shared memory when the thread that put its number there ends, however it
-ends (robust futexes: set_robust_list(2)). Whoever looks reads memory, without a system call. A
-descriptor of the process (pidfd) and its closed links tell it 8 to 18 ms later: its memory is torn
-down before. A second trigger beside the age rule, which alone judges a planner that hangs, or that
-is on another host.
+ends (robust futexes: set_robust_list(2)). A reader only reads memory, without a system call. A
+descriptor of the process (pidfd) and its closed links show the end 8 to 18 ms later, because its
+memory is torn down first. This is a second trigger beside the age rule (50 ms), which alone covers
+a planner that hangs or runs on another host.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _WORD_AT, _SESSION_AT = 8, 16
 _WORD: Final = struct.Struct("<L")
 _SESSION: Final = struct.Struct("<Q")
 _SEEN: Final = struct.Struct("<LLQ")
-"""What a reader reads, from the word on."""
+"""Layout of what a reader reads, from the word on."""
 _OWNER_DIED: Final = 0x4000_0000
 """FUTEX_OWNER_DIED."""
 _SET_ROBUST_LIST: Final = {"x86_64": 273, "aarch64": 99}
@@ -37,7 +37,7 @@ _SET_ROBUST_LIST: Final = {"x86_64": 273, "aarch64": 99}
 
 
 def path_of(run_dir: Path) -> Path:
-    """Return where the planner of a run directory says that it lives."""
+    """Return the path of the planner's shared memory in a run directory."""
     return live_dir(run_dir) / "planner.life"
 
 
@@ -52,13 +52,13 @@ class _Head(ctypes.Structure):
 
 
 class OwnLife:
-    """The planner's end: its thread's number in the word, and the session that it leads in."""
+    """The planner's side: its thread's number in the word, and the session in which it leads."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Open the memory, or make it; the directory is there. Keep the object: the kernel has it.
+        """Open or create the memory. Keep the object alive: the kernel holds its address.
 
         Raises:
-            FleetError: it cannot be made.
+            FleetError: it cannot be created.
         """
         self._memory = mapped(path_of(run_dir), _LIFE.size)
         self._entry = ctypes.c_char.from_buffer(self._memory)
@@ -68,14 +68,14 @@ class OwnLife:
         self._marked = _set_robust_list(self._head)
 
     def announce(self, session: int) -> None:
-        """Say that this thread, which lives as long as the process, leads in a session."""
-        if self._marked:  # otherwise nobody would be told of its end
+        """Publish that this thread, which lives as long as the process, leads in a session."""
+        if self._marked:  # otherwise nobody would see its end
             _WORD.pack_into(self._memory, _WORD_AT, threading.get_native_id())
             _SESSION.pack_into(self._memory, _SESSION_AT, session)
 
 
 def _set_robust_list(head: _Head) -> bool:
-    """Have the kernel mark the entry when this thread ends; False if it does not.
+    """Make the kernel mark the entry when this thread ends; False if it cannot.
 
     This replaces the C library's list for this thread: it must use no robust mutex.
     """
@@ -88,10 +88,10 @@ def _set_robust_list(head: _Head) -> bool:
 
 
 class PlannerLife:
-    """A joint service's eye on the planner of its host."""
+    """A joint service's side: watches the planner of its host."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Look from now on; otherwise as `OwnLife`."""
+        """Open the memory, as `OwnLife`."""
         self._memory = mapped(path_of(run_dir), _LIFE.size)
         self._told = 0
 
@@ -105,9 +105,11 @@ class PlannerLife:
 
 
 def if_possible(end: Callable[[Path], End], run_dir: Path) -> End | None:
-    """Return one of the two ends, or None and a warning: no service fails for a second trigger."""
+    """Return one of the two sides, or None and a warning: no service fails for a second trigger."""
     try:
         return end(run_dir)
     except FleetError as error:
-        log.get("xrl").warning("%s; a planner's end is seen by the age of its commands", error)
+        log.get("xrl").warning(
+            "%s; only the age of its commands will show that a planner has ended", error
+        )
         return None

@@ -1,4 +1,4 @@
-"""What every service's `__main__` does the same way: arguments, priority, stopping."""
+"""Common parts of every service's `__main__`: arguments, stopping, errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
 from shared.run_directory import default_run_dir, service_directory
 
 SOCKET_PATH_MAX = 100
-"""Longest path of a UNIX socket that works everywhere; the kernel takes 107 bytes."""
+"""Maximum length of a UNIX socket's path that works everywhere; the kernel takes 107 bytes."""
 
 
 def service_parser(description: str, example: str) -> argparse.ArgumentParser:
@@ -39,7 +39,7 @@ def service_parser(description: str, example: str) -> argparse.ArgumentParser:
 
 
 def add_injected(parser: argparse.ArgumentParser) -> None:
-    """Add the flag of a service whose links the network proxy can stand before."""
+    """Add the flag of a service whose links can pass through the network proxy."""
     parser.add_argument(
         "--injected",
         action="store_true",
@@ -48,13 +48,13 @@ def add_injected(parser: argparse.ArgumentParser) -> None:
 
 
 class StopFlag:
-    """True once SIGTERM or SIGINT has come; the loops look at it once a cycle."""
+    """True once SIGTERM or SIGINT was received; the loops check it once a cycle."""
 
     def __init__(self, *also: signal.Signals) -> None:
         """Stop at SIGTERM and SIGINT, and at `also`."""
         self.stopped = False
         self.interrupted = False
-        """SIGINT has come: the fleet goes down, and not this process alone."""
+        """SIGINT was received: the whole fleet goes down, not this process alone."""
         for number in (signal.SIGTERM, signal.SIGINT, *also):
             signal.signal(number, self._stop)
 
@@ -63,7 +63,7 @@ class StopFlag:
         self.interrupted |= number == signal.SIGINT
 
     def __bool__(self) -> bool:
-        """Return True if the process is to stop."""
+        """Return True if the process must stop."""
         return self.stopped
 
 
@@ -77,7 +77,7 @@ def freeze_garbage() -> None:
 def run_service(main: Callable[[], int]) -> None:
     """Run a service's main; an error becomes one line and an exit code, a bug its traceback too.
 
-    What it makes in the run directory is this user's alone.
+    Files that it creates are private to this user.
     """
     os.umask(0o077)
     try:
@@ -89,5 +89,5 @@ def run_service(main: Callable[[], int]) -> None:
         log.get("xrl").error("%s", os_error_in_words(error), exc_info=error.filename is None)
         sys.exit(XrlError.exit_code)
     except Exception:  # noqa: BLE001 - Python's own exit code would be 1
-        log.get("xrl").exception("a fault of this service, please report it")
+        log.get("xrl").exception("this is a bug in the service; please report it")
         sys.exit(BUG_EXIT_CODE)

@@ -1,6 +1,6 @@
-"""Which commit this code is of: git says so in a checkout, a file in a wheel.
+"""Commit of this code: from git in a checkout, from a file in a wheel.
 
-Standard library only: the wheel's build asks it too (`deploy/build_hook.py`).
+Standard library only, because the wheel's build uses it too (`deploy/build_hook.py`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from shared.places import CHECKOUT
 
 UNKNOWN: Final = "unknown"
 BUILT_FROM: Final = "shared/files/commit.json"
-"""Where a wheel says what it was built from."""
+"""File in a wheel that names the commit it was built from."""
 
 _GIT_TIMEOUT_S: Final = 5.0
 
@@ -22,9 +22,9 @@ _GIT_TIMEOUT_S: Final = 5.0
 def code(root: Path = CHECKOUT) -> dict[str, str]:
     """Return `git_commit` and `git_dirty` ("true"/"false"), of a checkout or of a wheel's origin.
 
-    Both are "unknown" if `root` is not the top of a git checkout with a commit, or if
-    git is not there: an installed wheel inside somebody else's checkout is not that
-    checkout. So they are of a wheel that was built where git said nothing.
+    Both are "unknown" if `root` is not the top of a git checkout with a commit, or git is missing:
+    a wheel installed inside another checkout is not that checkout. They are unknown, too, for a
+    wheel that was built without git.
     """
     try:
         built_from: dict[str, str] = json.loads((root / BUILT_FROM).read_text(encoding="utf-8"))
@@ -34,7 +34,7 @@ def code(root: Path = CHECKOUT) -> dict[str, str]:
 
 
 def in_words(found: dict[str, str]) -> str:
-    """Return a commit as a person reads it: twelve digits, and whether files were changed."""
+    """Return a commit as text: twelve digits, and whether files were changed."""
     changed = " with changes" if found["git_dirty"] == "true" else ""
     return f"commit {found['git_commit'][:12]}{changed}"
 
@@ -52,9 +52,9 @@ def _checked_out(root: Path) -> dict[str, str]:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Return what git says, or None if it fails for any reason.
+    """Return what git prints, or None if it fails for any reason.
 
-    Of a checkout that belongs to root, too, where a service runs as another user.
+    Works in a checkout that belongs to root, too, where a service runs as another user.
     """
     try:
         done = subprocess.run(

@@ -1,11 +1,12 @@
 """The run directory of a fleet, with its logs, and the live directory, with its sockets and memory.
 
-The run directory names the fleet and may lie on a disk. Everything that a restart creates, removes
-or opens for writing lies in the live directory (`live_dir`), which is in memory: a service must
-come back after the disk has turned read-only.
+The run directory names the fleet and may be on a disk. Everything that a restart creates, removes
+or opens for writing is in the live directory (`live_dir`), in memory: a service must come back
+after the disk has turned read-only.
 
-The names of both can be guessed, and both may lie in a folder where everybody may write: a
-directory that is somebody else's, or that others may write to, is refused wherever one is named.
+The names of both can be guessed, and both may be in a folder where everybody may write. So a
+directory that belongs to another user, or that others may write to, is refused wherever it is
+named.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def live_dir(run_dir: Path) -> Path:
 def _memory_folder(folders: tuple[Path, ...]) -> Path | None:
     """Return the first folder that is in memory and where every user may write, or None.
 
-    Goes by type and mode, not by what this process may write: a systemd unit and a shell must
+    Decides by type and mode, not by what this process may write: a systemd unit and a shell must
     find the same folder.
     """
     mounts = [line.split() for line in Path("/proc/self/mounts").read_text("utf-8").splitlines()]
@@ -88,9 +89,9 @@ def make_live_dir(run_dir: Path) -> Path:
 def check_own(path: Path, *, alone: bool = True) -> None:
     """Refuse a run directory that is not this user's, or whose live directory is not.
 
-    A directory that does not exist is no fault. `alone`: refuse one that others may write to, too,
-    itself or a directory above it. A fleet is not started or acted on in such a one; it can be
-    stopped, for it may have become one while the fleet was up. Raises FleetError.
+    A missing directory is accepted. `alone`: also refuse a directory if others may write to it or
+    to one above it. A fleet is not started or acted on there. It can be stopped, because the rights
+    may have changed while it was up. Raises FleetError.
     """
     for directory in dict.fromkeys((path, live_dir(path))):
         _check_directory(directory, alone=alone)
@@ -109,13 +110,13 @@ def _check_directory(path: Path, *, alone: bool) -> None:
     except OSError as error:
         if error.errno == errno.EIO:
             return  # the disk has failed; the fleet on it can still be stopped and signalled
-        raise FleetError(f"{path}: cannot be a run directory: {error.strerror}") from None
+        raise FleetError(f"{path}: cannot be used as a run directory: {error.strerror}") from None
     if not stat.S_ISDIR(found.st_mode):
-        raise FleetError(f"{path}: is no directory; give another --run-dir")
+        raise FleetError(f"{path}: is not a directory; give another --run-dir")
     _check_owner(path, found.st_uid)
     if alone and found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise FleetError(
-            f"{path}: others may write to it; `chmod go-w {shlex.quote(str(path))}`, "
+            f"{path}: other users can write to it; run `chmod go-w {shlex.quote(str(path))}`, "
             "or give another --run-dir"
         )
     if alone:
@@ -123,10 +124,10 @@ def _check_directory(path: Path, *, alone: bool) -> None:
 
 
 def _check_parents(path: Path) -> None:
-    """Refuse a directory that another user could replace: who may write to one above it can.
+    """Refuse a directory that another user could replace by writing to one above it.
 
-    As sshd's StrictModes: each is this user's or root's, and if others may write to it, only the
-    owner of an entry may rename that (the sticky bit, as /tmp has it).
+    As sshd's StrictModes: each directory above belongs to this user or root. If others may write to
+    it, only the owner of an entry may rename that entry (the sticky bit, as /tmp has it).
     """
     for above in dict.fromkeys((*path.absolute().parents, *path.resolve().parents)):
         try:
@@ -136,8 +137,8 @@ def _check_parents(path: Path) -> None:
         if found.st_uid not in (0, os.getuid()):
             wrong = f"{above} belongs to another user, who can replace it"
         elif _others_may_rename_in(found):
-            remedy = f"`chmod go-w {shlex.quote(str(above))}`"
-            wrong = f"others may write to {above} and replace it; {remedy}"
+            remedy = f"run `chmod go-w {shlex.quote(str(above))}`"
+            wrong = f"other users can write to {above} and replace it; {remedy}"
         else:
             continue
         raise FleetError(f"{path}: {wrong}; or give another --run-dir")
@@ -151,7 +152,7 @@ def _others_may_rename_in(directory: os.stat_result) -> bool:
 
 
 def _is_own_group(gid: int) -> bool:
-    """Return True for the group that many systems make for each user, with nobody else in it."""
+    """Return True for the group that many systems make for each user, without other members."""
     try:
         group, user = grp.getgrgid(gid), pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
@@ -160,10 +161,9 @@ def _is_own_group(gid: int) -> bool:
 
 
 def open_private(path: Path) -> BinaryIO:
-    """Open a file of this user alone to read and write, or make it, whatever the umask.
+    """Open or create a file to read and write, for this user alone, whatever the umask.
 
-    One that others could read or write, left by an older version, is taken from them. Raises
-    OSError if it is a link or somebody else's.
+    If others had access to it, they lose it. Raises OSError if it is a link or another user's.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
     os.fchmod(descriptor, PRIVATE)
@@ -171,12 +171,12 @@ def open_private(path: Path) -> BinaryIO:
 
 
 def mapped(path: Path, size: int) -> mmap.mmap:
-    """Return a shared file as memory, made with its directory if missing, for this user alone.
+    """Return a shared file as memory; create it and its directory if missing, for this user alone.
 
     Its space is allocated now: on a full disk the first store would end the process (SIGBUS).
 
     Raises:
-        FleetError: it cannot be made.
+        FleetError: it cannot be created.
     """
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -185,12 +185,12 @@ def mapped(path: Path, size: int) -> mmap.mmap:
             return mmap.mmap(file.fileno(), size)
     except OSError as error:
         words = os_error_in_words(OSError(error.errno, error.strerror))
-        raise FleetError(f"{path}: no shared memory: {words}") from None
+        raise FleetError(f"{path}: cannot create shared memory: {words}") from None
 
 
 @contextlib.contextmanager
 def private_files() -> Iterator[None]:
-    """Make what is created meanwhile this user's alone, whatever the umask."""
+    """Make files that are created meanwhile private to this user, whatever the umask."""
     before = os.umask(0o077)
     try:
         yield
@@ -199,10 +199,10 @@ def private_files() -> Iterator[None]:
 
 
 def service_directory(text: str) -> Path:
-    """Return the run directory of a service, which somebody may have started by hand.
+    """Return the run directory of a service, checked if it was started by hand.
 
-    Under a supervisor it was looked at when the fleet started; a successor of a service that
-    crashed begins whatever has become of it, because its module is to be held. Raises
+    Under a supervisor it was checked when the fleet started. A service that replaces a crashed one
+    starts whatever the directory has become, because its module must be held. Raises
     argparse.ArgumentTypeError as `check_own`.
     """
     return Path(text) if FLEET_VARIABLE in os.environ else own_directory(text, alone=True)

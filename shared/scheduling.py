@@ -27,7 +27,7 @@ class _ProcessSchedule(NamedTuple):
     fifo: int
     """SCHED_FIFO priority, 1 .. 99."""
     half: Literal["first", "second", "by leg"]
-    """Half of the processors: a leg and who feeds it share their caches."""
+    """Half of the processors: a leg and the processes that feed it share their caches."""
 
 
 TABLE: Final[dict[str, _ProcessSchedule]] = {
@@ -39,21 +39,21 @@ TABLE: Final[dict[str, _ProcessSchedule]] = {
     "imu": _ProcessSchedule(10, "first"),
     "recorder": _ProcessSchedule(5, "second"),
 }
-"""By kind of process. The right leg is on the first half, the left leg on the second. Without real
-time the recorder lost 600 and 1200 messages in a demo, on any processor."""
+"""By kind of process. The right leg is on the first half, the left leg on the second. Without
+real-time priority the recorder lost 600 and 1200 messages in a demo, on any processor."""
 
 _PR_SET_TIMERSLACK: Final = 29
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "armv7l": 380}
 _SCHED_ATTR: Final = struct.Struct("=IIQiIQQQ")
 """size, policy, flags, nice, priority, runtime, deadline, period."""
 SLICE_NS: Final = 100_000
-"""The shortest slice that the kernel gives: a short slice is a near deadline (EEVDF)."""
+"""Shortest slice that the kernel grants; a short slice is a near deadline (EEVDF)."""
 TIMER_SLACK_NS: Final = 1_000
-"""Sleeps end so close to their time; the default is 50 us."""
+"""Maximum delay at the end of a sleep; the default is 50 us."""
 NO_PAUSE: Final = "kernel.sched_rt_runtime_us=-1"
-"""The kernel's setting without `real_time_pause_ms`, before Linux 6.12: deploy/sysctl."""
+"""Kernel setting that ends the pause of `real_time_pause_ms`, before Linux 6.12: deploy/sysctl."""
 IDLE_LATENCY: Final = "dev/cpu_dma_latency"
-"""The kernel's file for the time that an idle processor may take to wake up (PM QoS)."""
+"""Kernel file for the maximum wake-up time of an idle processor (PM QoS)."""
 _CAP_IPC_LOCK: Final = 14
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
@@ -72,7 +72,7 @@ def apply(kind: str, module: str = "") -> str:
 
 
 def half_of(processors: Collection[int], kind: str, module: str = "") -> set[int]:
-    """Return the processors of a process, out of those that there are; a single one is for all."""
+    """Return a process's processors, out of the available ones; a single one is for all."""
     half = TABLE[kind].half
     if half == "by leg":
         half = "first" if side_of(module) == SIDES[0] else "second"
@@ -82,7 +82,7 @@ def half_of(processors: Collection[int], kind: str, module: str = "") -> set[int
 
 
 def _core_of(processor: int) -> tuple[int, int, int]:
-    """Return what sorts processors so that two threads of a core are neighbours."""
+    """Return a sort key that makes two threads of a core neighbours."""
     topology = Path(f"/sys/devices/system/cpu/cpu{processor}/topology")
     try:
         package, core = (
@@ -102,10 +102,12 @@ def _pin(processors: set[int]) -> str:
 
 
 def raise_priority(fifo: int) -> str:
-    """Set SCHED_FIFO, or what needs no privilege; return what was granted."""
+    """Set SCHED_FIFO, or a fallback that needs no privilege; return what was granted."""
     limit_us = _real_time_limit_us()
     if limit_us is not None:
-        return f"{short_slice()}, no real time: RLIMIT_RTTIME of {limit_us} us would kill it"
+        return (
+            f"{short_slice()}, no real time: RLIMIT_RTTIME of {limit_us} us would end the process"
+        )
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(fifo))
     except (OSError, AttributeError):
@@ -114,10 +116,10 @@ def raise_priority(fifo: int) -> str:
 
 
 def keep_processors_awake(root: Path = Path("/")) -> int | None:
-    """Have idle processors wait awake, as long as the returned descriptor stays open.
+    """Keep idle processors awake as long as the returned descriptor stays open; None if refused.
 
     A processor that sleeps between two cycles wakes up slowly and with cold caches: in three pairs
-    of runs the fleet took 8 to 19 % less time on processors that stay awake. None if it is refused.
+    of runs the fleet took 8 to 19 % less time on processors that stay awake.
     """
     try:
         held = os.open(root / IDLE_LATENCY, os.O_WRONLY)
@@ -136,9 +138,9 @@ def has_real_time(pid: int) -> bool | None:
 
 
 def real_time_pause_ms(root: Path = Path("/")) -> float:
-    """Return how long the kernel stops real-time processes that have filled a processor, ms.
+    """Return how long the kernel pauses real-time processes that have filled a processor, ms.
 
-    By default 50 ms of each second. 0: never, or this kernel does not say it.
+    By default 50 ms of each second. 0: never, or unknown.
     """
     kernel = root / "proc/sys/kernel"
     try:
@@ -151,10 +153,10 @@ def real_time_pause_ms(root: Path = Path("/")) -> float:
 
 
 def _real_time_limit_us() -> int | None:
-    """Lift the limit of computing without a pause in real time; return the one that stays, us.
+    """Lift the limit on real-time computing without a pause; return the limit that stays, us.
 
-    Beyond it the kernel ends a process (SIGXCPU, then SIGKILL), which is no way for a service to
-    find that a cycle took long.
+    Beyond it the kernel ends a process (SIGXCPU, then SIGKILL). A long cycle must not end a
+    service.
     """
     soft, _hard = resource.getrlimit(resource.RLIMIT_RTTIME)
     if soft == resource.RLIM_INFINITY:

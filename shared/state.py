@@ -1,4 +1,4 @@
-"""State of a law as data: a mutable struct that holds all that changes, and nothing else.
+"""State of a law as data: a mutable struct that holds everything that changes, and nothing else.
 
 A law keeps its state in `state`, and continues bit for bit from a copy of it.
 """
@@ -13,7 +13,7 @@ S = TypeVar("S")
 
 
 def copied(state: S) -> S:
-    """Return a copy that shares nothing that changes: structs and lists are copied, deeply."""
+    """Return a deep copy of structs and lists; immutable parts are shared."""
     copy: Any = state
     if isinstance(state, msgspec.Struct):
         if type(state).__struct_config__.frozen:

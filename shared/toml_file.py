@@ -1,7 +1,7 @@
-"""TOML files, of whatever editor, read into typed structs, every number inside its `Range`.
+"""Read TOML files into typed structs, with every number inside its `Range`.
 
-Text is UTF-8, with a byte order mark or without: Windows' editors set it, and TOML and JSON have no
-place for it. What does not fit is refused with the file, the key, the value and what would be right
+Text is UTF-8. A byte order mark, which Windows' editors write, is skipped: TOML and JSON have no
+place for it. Invalid content is refused with the file, the key, the value and the right value
 (`shared.exceptions.ConfigError`).
 """
 
@@ -40,7 +40,7 @@ _OTHERS: Final = (
 
 
 def decoded(content: bytes) -> str:
-    """Return the text of a file's content; UnicodeError says what it is instead of UTF-8."""
+    """Return the text of a file's content; UnicodeError names another encoding or the bad byte."""
     for name, mark in _OTHERS:
         if content.startswith(mark):
             raise UnicodeError(f"is {name}; save it as UTF-8")
@@ -49,12 +49,12 @@ def decoded(content: bytes) -> str:
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise UnicodeError(
-            f"is no UTF-8 text: byte 0x{content[error.start]:02x} in line {line}; save it as UTF-8"
+            f"is not UTF-8 text: byte 0x{content[error.start]:02x} in line {line}; save it as UTF-8"
         ) from None
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file; OSError if it cannot be read, UnicodeError if it is no UTF-8."""
+    """Return the text of a file; OSError if it cannot be read, UnicodeError if it is not UTF-8."""
     return decoded(path.read_bytes())
 
 
@@ -62,7 +62,7 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 class Range(NamedTuple):
-    """Range of a number, with text for an error."""
+    """Range of a number, with its unit."""
 
     low: float
     high: float
@@ -81,15 +81,17 @@ def read_toml(path: Path, into: type[S]) -> S:
     file = str(path)
     try:
         found = path.stat()
-        if not stat.S_ISREG(found.st_mode):  # a pipe would be waited on for ever
-            raise ConfigError(file, "(file)", "no ordinary file", "give the path of a TOML file")
+        if not stat.S_ISREG(found.st_mode):  # reading a pipe would block forever
+            raise ConfigError(file, "(file)", "not a regular file", "give the path of a TOML file")
         if found.st_size > SIZE_MAX:
-            raise ConfigError(file, "(file)", f"over {SIZE_MAX >> 20} MiB", "a TOML file")
+            raise ConfigError(
+                file, "(file)", f"larger than {SIZE_MAX >> 20} MiB", "give a TOML file"
+            )
         text = read_text(path)
     except FileNotFoundError:
         raise ConfigError(file, "(file)", "not found", "give the path of a TOML file") from None
     except (OSError, UnicodeError) as error:
-        raise ConfigError(file, "(file)", f"cannot be read: {error}", "a TOML file") from None
+        raise ConfigError(file, "(file)", f"cannot be read: {error}", "give a TOML file") from None
     return parse_toml(text, file, into)
 
 
@@ -98,9 +100,9 @@ def parse_toml(text: str, file: str, into: type[S]) -> S:
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(file, "(syntax)", str(error), "TOML 1.0 is read") from None
+        raise ConfigError(file, "(syntax)", str(error), "must be TOML 1.0") from None
     except RecursionError:
-        raise ConfigError(file, "(syntax)", "nested too deeply", "a few levels are right") from None
+        raise ConfigError(file, "(syntax)", "nested too deeply", "use only a few levels") from None
     try:
         config = msgspec.convert(raw, into)
     except msgspec.ValidationError as error:
@@ -110,7 +112,7 @@ def parse_toml(text: str, file: str, into: type[S]) -> S:
 
 
 def _as_config_error(file: str, raw: dict[str, Any], into: Any, message: str) -> ConfigError:
-    """Turn msgspec's "Expected `float`, got `str` - at `$.mass.module`" into our words."""
+    """Turn msgspec's "Expected `float`, got `str` - at `$.mass.module`" into a ConfigError."""
     reason, _, place = message.partition(" - at `")
     path = place.rstrip("`").removeprefix("$").removeprefix(".")
     key, found, hint = _follow(path, raw, into)
@@ -123,14 +125,14 @@ def _as_config_error(file: str, raw: dict[str, Any], into: Any, message: str) ->
         full = f"{key}.{missing[1]}".lstrip(".")
         return ConfigError(file, full, "missing", "this key is required")
     if get_origin(hint) is Literal:
-        reason = f"one of {', '.join(map(str, get_args(hint)))}"
-    return ConfigError(file, key or "(file)", f"{found!r} does not fit", reason)
+        reason = f"must be one of {', '.join(map(str, get_args(hint)))}"
+    return ConfigError(file, key or "(file)", f"{found!r} is not valid", reason)
 
 
 def _follow(path: str, raw: Any, hint: Any) -> tuple[str, Any, Any]:
     """Return the full key, the value and the type hint at a msgspec path.
 
-    msgspec writes `[...]` for an entry of a free table: it is the first that does not fit.
+    msgspec writes `[...]` for an entry of a free table: the first entry that does not fit.
     """
     key, value = "", raw
     for name, index in re.findall(r"([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", path):

@@ -57,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _tell("xrl: interrupted")
             return INTERRUPTED
         except Exception:  # noqa: BLE001 - Python's own exit code would be 1: a robot that fell
-            bug = "xrl: a fault of xrl itself: please report the lines above"
+            bug = "xrl: this is a bug in xrl; please report the lines above"
             _tell(f"{traceback.format_exc()}{bug}")
             return BUG_EXIT_CODE
 
@@ -69,12 +69,12 @@ def _run(arguments: Sequence[str]) -> int:
     except SystemExit:
         sys.stdout.flush()
         raise
-    sys.stdout.flush()  # a full disk is told here; at the interpreter's end it would be a traceback
+    sys.stdout.flush()  # report a full disk here; at the interpreter's exit it prints a traceback
     return code
 
 
 def _with_values(arguments: Sequence[str]) -> list[str]:
-    """Join flags and lists of numbers that begin with a minus: argparse sees options in those."""
+    """Join a flag and a list of numbers that begins with a minus: argparse takes it for a flag."""
     joined: list[str] = []
     for word in arguments:
         if joined and joined[-1].startswith("--") and _NEGATIVE_LIST.match(word):
@@ -85,14 +85,14 @@ def _with_values(arguments: Sequence[str]) -> list[str]:
 
 
 def _tell(words: str) -> None:
-    """Print an error; a standard error that is gone changes no exit code."""
+    """Print an error; a closed standard error does not change the exit code."""
     with contextlib.suppress(OSError):
         print(words, file=sys.stderr)
     _drop_output()
 
 
 def _drop_output() -> None:
-    """Discard output that cannot be written, or Python tries again, and fails, at its end."""
+    """Discard output that cannot be written; otherwise Python retries at exit and fails."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(ValueError):
             try:
@@ -104,7 +104,7 @@ def _drop_output() -> None:
 
 
 class _TopParser(FlagParser):
-    """Its help fits on one screen: two verbs or nouns a line, by who needs them."""
+    """Parser whose help fits on one screen: two verbs or nouns per line, by purpose."""
 
     def format_help(self) -> str:
         """Return the help."""
@@ -124,7 +124,7 @@ def whole_parser() -> argparse.ArgumentParser:
 
 
 def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.ArgumentParser:
-    """Return the parser, complete for the verb in use and with one line for each other."""
+    """Return the parser, complete for the verb in use, with one line for every other verb."""
     parser = _TopParser(
         prog="xrl",
         usage="xrl [--version] VERB ...",
@@ -146,7 +146,7 @@ def _parser(arguments: Sequence[str], *, whole: bool = False) -> argparse.Argume
 
 
 def _below(noun: str, below: dict[str, Subparsers]) -> Subparsers:
-    """Return where the verbs of a noun are added; adds the noun, if no verb has its name."""
+    """Return the subparsers of a noun; add the noun unless a verb has its name."""
     above, _, word = noun.rpartition(" ")
     among = below.get(above) or _below(above, below)
     parser = among.choices.get(word)
@@ -157,9 +157,9 @@ def _below(noun: str, below: dict[str, Subparsers]) -> Subparsers:
 
 
 def _asked(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> str:
-    """Return the verb, or else the noun, that a command line begins with; "" for none.
+    """Return the verb or noun that a command line begins with, or "".
 
-    A word that is neither is refused, with what may be meant.
+    An unknown word ends the program with a suggestion.
     """
     names = {verb.name for verb in VERBS} | set(NOUNS)
     found = ""
@@ -186,7 +186,7 @@ def _refuse(parser: argparse.ArgumentParser, noun: str, word: str, begin: str) -
 
 
 class _Version(argparse.Action):
-    """`--version`: and the commit that this code is of."""
+    """`--version`: prints version and commit."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, **options: Any) -> None:
         super().__init__(option_strings, dest, nargs=0, **options)
@@ -200,7 +200,7 @@ class _Version(argparse.Action):
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:
-    """Leave as if by an exception, so that what a verb has started is stopped again."""
+    """Exit by an exception, so that a verb stops what it has started."""
     sys.exit(128 + number)
 
 

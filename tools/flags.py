@@ -1,14 +1,14 @@
-"""A verb's flags as typed fields: parser, checks, help, completion and reference page follow.
+"""Typed fields that declare a verb's flags, and the parser and checks made from them.
 
     class HzFlags(RunDirFlags):
         topic: Annotated[tuple[str, ...], positional("TOPIC")] = ()
         \"\"\"such as 'joint/*/state' (default: all)\"\"\"
         for_s: Annotated[Seconds | None, option("--for")] = None
-        \"\"\"measure so long\"\"\"
+        \"\"\"stop after S seconds\"\"\"
 
-The type says what is read: `bool` is a switch, a `Literal` a choice, a tuple may be repeated, a
-number has a `Range` with its unit. The string below a field is its help; rules that cross fields
-are in `check`.
+A field's type determines how its flag is parsed: `bool` is a switch, a `Literal` is a choice, a
+tuple may be repeated, and a number has a `Range` with its unit. The string below a field is its
+help, also for completion and the reference page. `check` holds rules that involve several fields.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Seconds = Annotated[float, Range(0.0, FINITE_MAX, "s")]
 Duration = Annotated[float, Range(1e-3, FINITE_MAX, "s")]
 Count = Annotated[int, Range(1, 1_000_000, "")]
 Natural = Annotated[int, Range(0, 2**63 - 1, "")]
-"""A seed, a case."""
+"""Seed, or number of a case."""
 Rate = Annotated[float, Range(1e-3, 1e4, "Hz")]
 Degrees = Annotated[int, Range(-360, 360, "degrees")]
 
@@ -66,37 +66,37 @@ class Flags:
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
     def check(self) -> None:
-        """Refuse flags that do not fit each other, by an `XrlError` that says what would be right.
+        """Raise an `XrlError` if flags contradict each other; its message says what is valid.
 
-        Who overrides it calls `super().check()` first.
+        An override calls `super().check()` first.
         """
 
 
 class Arg(NamedTuple):
-    """What a field's type does not say about its flag."""
+    """Properties of a flag that its field's type does not give."""
 
     names: tuple[str, ...] = ()
-    """The flag's names; none: `--` and the field's name."""
+    """Names of the flag; if empty, `--` and the field's name."""
     metavar: str = ""
     choices: tuple[str, ...] = ()
-    """As of a `Literal`, where a table elsewhere has them."""
+    """Valid values from a table elsewhere; otherwise like a `Literal`."""
     parse: Callable[[str], Any] | None = None
-    """Reads one value; raises ValueError or argparse.ArgumentTypeError that says what is right."""
+    """Parser of one value; its ValueError or argparse.ArgumentTypeError says what is valid."""
     is_positional: bool = False
     is_one: bool = False
-    """One word gives the whole tuple."""
+    """True if one word holds the whole tuple."""
     exclusive: str = ""
-    """Flags of the same word here exclude each other."""
+    """Name of a group of flags that exclude each other."""
     one_of: str = ""
-    """Exactly one flag of those with the same word here is required."""
+    """Name of a group of flags of which exactly one is required."""
     group: str = ""
-    """Heading in the help; further lines describe what follows."""
+    """Heading in the help; further lines describe the group."""
     help: str = ""
-    """In place of the string below the field, where it has to be computed."""
+    """Computed help, which replaces the string below the field."""
 
 
 def option(*names: str, **more: Any) -> Arg:
-    """Return a flag of other names than the field's."""
+    """Return a flag whose names differ from the field's."""
     return Arg(names, **more)
 
 
@@ -107,7 +107,7 @@ def positional(metavar: str, **more: Any) -> Arg:
 
 Folder = Annotated[Path, Arg(metavar="DIR")]
 Module = Annotated[str, Arg(choices=MODULES, metavar="MODULE")]
-RUN_HELP: Final = "a run's record, finished or not; or its directory: all files of a split run"
+RUN_HELP: Final = "record of a run, finished or not; or its directory, for all files of a split run"
 Run = Annotated[Path, positional("RUN", help=RUN_HELP)]
 
 
@@ -117,25 +117,27 @@ def parsed(parse: Callable[[str], Any], metavar: str, **more: Any) -> Arg:
 
 
 def names_of(known: Collection[str] = ()) -> Callable[[str], tuple[str, ...]]:
-    """Return what reads names separated by commas, each once; without a table any names."""
+    """Return a parser of names separated by commas, each once; an empty table allows any name."""
 
     def parse(text: str) -> tuple[str, ...]:
         names = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
         for name in names:
             if known and name not in known:
-                raise argparse.ArgumentTypeError(f"{name[:40]!r}: one of {', '.join(known)}")
+                raise argparse.ArgumentTypeError(
+                    f"{name[:40]!r}: must be one of {', '.join(known)}"
+                )
         return names
 
     return parse
 
 
 def numbers(count: int, like: str) -> Callable[[str], tuple[float, ...]]:
-    """Return what reads a count of numbers, separated by commas or spaces, such as `like`."""
+    """Return a parser of `count` numbers separated by commas or spaces; `like` describes them."""
 
     def parse(text: str) -> tuple[float, ...]:
         words = text.replace(",", " ").split()
         if len(words) != count:
-            raise argparse.ArgumentTypeError(f"{len(words)} numbers; {count} are right; {like}")
+            raise argparse.ArgumentTypeError(f"got {len(words)} numbers, expected {count}: {like}")
         found = []
         for word in words:
             try:
@@ -143,7 +145,9 @@ def numbers(count: int, like: str) -> Callable[[str], tuple[float, ...]]:
             except ValueError:
                 found.append(math.nan)
             if not abs(found[-1]) <= FINITE_MAX:
-                raise argparse.ArgumentTypeError(f"{word[:40]!r}: no such number; {like}")
+                raise argparse.ArgumentTypeError(
+                    f"{word[:40]!r}: not a valid number; expected {like}"
+                )
         return tuple(found)
 
     return parse
@@ -152,7 +156,7 @@ def numbers(count: int, like: str) -> Callable[[str], tuple[float, ...]]:
 class _Field(NamedTuple):
     name: str
     kind: Any
-    """Type of one value, without None, notes and the tuple around it."""
+    """Type of one value, without None, annotations and the enclosing tuple."""
     limits: Range | None
     arg: Arg
     help: str
@@ -183,7 +187,7 @@ def fields_of(declaration: type[Flags]) -> Iterator[_Field]:
 
 
 def field_docs(struct: type) -> dict[str, str]:
-    """Return the docstring below each field in one line, those of base classes included."""
+    """Return the docstring below each field, base classes included, as one line."""
     docs: dict[str, str] = {}
     for owner in reversed(struct.__mro__):
         if owner.__module__.partition(".")[0] in _OUR_PACKAGES:
@@ -260,7 +264,7 @@ def _argument(field: _Field) -> dict[str, Any]:
     arg, kind = field.arg, field.kind
     found: dict[str, Any] = {
         "help": field.help.replace("%", "%%"),
-        "default": argparse.SUPPRESS,  # the declaration's own default holds then
+        "default": argparse.SUPPRESS,  # the declaration's own default applies
     }
     if not arg.is_positional:
         found |= {"dest": field.name, "required": field.is_required}
@@ -278,7 +282,7 @@ def _argument(field: _Field) -> dict[str, Any]:
     elif field.is_repeated:
         found["action"] = "append"
     elif arg.is_positional and not field.is_required:
-        found |= {"nargs": "?", "default": None}  # argparse would read the text of SUPPRESS
+        found |= {"nargs": "?", "default": None}  # argparse would parse SUPPRESS as a value
     return found
 
 
@@ -305,7 +309,7 @@ def _number(kind: type[int] | type[float], limits: Range, text: str) -> float:
     except ValueError:
         number = math.nan
     if not limits.low <= number <= limits.high:
-        raise argparse.ArgumentTypeError(f"{text[:40]!r}: {_right(kind, limits)} is right")
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: must be {_right(kind, limits)}")
     return number
 
 
@@ -319,10 +323,10 @@ def _right(kind: type, limits: Range) -> str:
 
 
 def read_flags(declaration: type[F], found: argparse.Namespace) -> F:
-    """Return what was given, with the declaration's defaults for the rest, checked.
+    """Return the given flags, checked, with the declaration's defaults for the rest.
 
     Raises:
-        XrlError: flags do not fit each other, or a default cannot be had.
+        XrlError: flags contradict each other, or a default cannot be determined.
     """
     given = {
         field.name: tuple(value) if field.is_repeated else value
@@ -341,17 +345,17 @@ def _own_run_dir() -> Path:
 
 
 class RunDirFlags(Flags):
-    """Which fleet is meant."""
+    """Fleet that a verb acts on."""
 
     run_dir: Annotated[Path, parsed(own_directory, "DIR")] = dataclasses.field(
         default_factory=_own_run_dir
     )
-    """run directory: names the fleet and holds its logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID
-    of the user)"""
+    """run directory, which identifies the fleet and holds its logs (default: $XRL_RUN_DIR, else
+    /tmp/xrl-UID)"""
 
 
 class ConfigFlags(Flags):
-    """Which robot is meant: its file, found in the working directory if it is not given."""
+    """Robot file; the default is the one in the working directory."""
 
     config: Annotated[Path, parsed(places.config_argument, "FILE", help=places.HELP)] = (
         dataclasses.field(default_factory=places.robot_file)
@@ -359,24 +363,24 @@ class ConfigFlags(Flags):
 
 
 def robot_file_of(before: str) -> Arg:
-    """Return the flag of a verb that looks elsewhere for the robot file before it looks here.
+    """Return the flag for a robot file whose first default is `before`, ahead of the usual ones.
 
-    The field is None if it is not given; the verb calls `places.robot_file` itself.
+    The field is None if the flag is not given; the verb then calls `places.robot_file` itself.
     """
     text = places.HELP.replace("(default: ", f"(default: {before}, else ")
     return Arg(metavar="FILE", help=text)
 
 
 class FleetRobotFlags(RunDirFlags):
-    """Fleet and robot: the robot file is the fleet's, if there is a fleet."""
+    """Fleet and robot file; by default the robot file of the running fleet, if there is one."""
 
     config: Annotated[Path | None, robot_file_of("that of the fleet in --run-dir")] = None
 
 
 class MotionFlags(FleetRobotFlags):
-    """A motion of the robot that a person sees first, and agrees to."""
+    """Motion of the robot that is shown first and that a person must confirm."""
 
     yes: bool = False
-    """do not ask"""
+    """do not ask for confirmation"""
     dry_run: bool = False
-    """show the motions, move nothing"""
+    """show the motions without moving anything"""

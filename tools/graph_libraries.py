@@ -1,7 +1,7 @@
 """Translates a robot's graphs into C and keeps the libraries: `python -m tools.graph_libraries`.
 
-The graphs are the law's, the simulated drivetrain's and the simulated drives'. A library is kept
-only if it gives the graph's own numbers, to the last bit, on drawn arguments
+The graphs are those of the law, of the simulated drivetrain and of the simulated drives. A library
+is kept only if its results equal the graph's own, to the last bit, on random arguments
 (`shared.robot.compiled_graph`).
 """
 
@@ -38,24 +38,24 @@ from shared.robot.compiled_graph import FLAGS, FOLDER, library_of
 from tools.flags import ConfigFlags, add_flags, read_flags
 
 SAMPLES: Final = 200
-"""Drawn arguments on which library and graph must agree."""
+"""Number of random arguments on which library and graph must agree."""
 DRAWN_MAX: Final = (0.3, 2.0)
-"""Largest drawn arguments, in turn: with the first most results are numbers, the second is as far
-as joints go."""
+"""Largest random arguments, used in turn. With the first, most results are numbers; the second
+covers the range of the joints."""
 _HELPERS_BEGIN: Final = '#pragma GCC push_options\n#pragma GCC optimize ("fp-contract=fast")\n'
 _HELPERS_END: Final = "/* Configuration this file was compiled with */\n"
-"""In the C of a graph: up to here are functions that CasADi's own library has as well."""
+"""In the C code of a graph: the functions before this line are in CasADi's own library too."""
 _HELPER: Final = re.compile(r"^(?=(?:void|int|casadi_int|casadi_real) casadi_\w+\()", re.MULTILINE)
-_NO_COMPILER: Final = "no C compiler `cc` on PATH: CasADi interprets the law's graphs, all runs"
+_NO_COMPILER: Final = "no C compiler `cc` on PATH: CasADi interprets the law's graphs, and all runs"
 
 
 def command() -> str:
-    """Return the command that runs this module, from wherever it is typed."""
+    """Return the command that runs this module from any directory."""
     return shlex.join([sys.executable, "-P", "-m", "tools.graph_libraries"])
 
 
 def graphs_of(robot: RobotConfig) -> list[ca.Function]:
-    """Return the graphs of the law, and of the simulator where the extra `sim` is installed."""
+    """Return the graphs of the law, and those of the simulator if the extra `sim` is installed."""
     graphs = [*symbolic.build(robot, leg_geometry(robot)), certificate.stiffness_graph()]
     if is_installed("sim"):
         body = body_of(robot, PlantConfig())
@@ -67,7 +67,7 @@ def graphs_of(robot: RobotConfig) -> list[ca.Function]:
 
 
 def build(function: ca.Function, folder: Path = FOLDER) -> Path:
-    """Translate a graph into C, compile it, compare both, and keep the library."""
+    """Translate a graph into C, compile it, compare the two, and keep the library."""
     compiler = shutil.which("cc")
     if compiler is None:
         raise RunError(_NO_COMPILER)
@@ -81,20 +81,20 @@ def build(function: ca.Function, folder: Path = FOLDER) -> Path:
 
 
 def translation(function: ca.Function) -> str:
-    """Return a graph as C.
+    """Return a graph as C code.
 
-    The interpreter computes operation by operation, but calls its library for products of matrices
-    and the like. On Arm that library has fused multiply-adds, so the C has them in the same places.
+    The interpreter computes operation by operation, but calls CasADi's library for matrix products
+    and similar. On Arm that library has fused multiply-adds, so the C code has them there too.
     """
     code = ca.CodeGenerator(f"{function.name()}.c")
     code.add(function)
     helpers, end, own = code.dump().partition(_HELPERS_END)
-    helpers = _HELPER.sub("static ", helpers)  # of others GCC 14 does not take the option
+    helpers = _HELPER.sub("static ", helpers)  # GCC 14 applies the option only to static ones
     return f"{_HELPERS_BEGIN}{helpers}#pragma GCC pop_options\n{end}{own}"
 
 
 def _build(function: ca.Function, compiler: str, path: Path) -> None:
-    """Build a library under another name, and move it to its path only if it proves right."""
+    """Build a library under a temporary name, and move it to its path only if it is correct."""
     folder = path.parent
     with tempfile.TemporaryDirectory(dir=folder) as name:
         here, source = Path(name), f"{function.name()}.c"
@@ -113,7 +113,7 @@ def _build(function: ca.Function, compiler: str, path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Have a file or folder on the disk: half a library would end every process that loads it."""
+    """Flush a file or folder to disk: half a library would crash every process that loads it."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -122,7 +122,7 @@ def _sync(path: Path) -> None:
 
 
 def compare(function: ca.Function, translated: ca.Function) -> None:
-    """Compare a graph with its translation on drawn arguments."""
+    """Compare a graph with its translation on random arguments."""
     draw, finite = np.random.default_rng(1), 0
     for sample in range(SAMPLES):
         most = DRAWN_MAX[sample % 2]
@@ -133,14 +133,14 @@ def compare(function: ca.Function, translated: ca.Function) -> None:
             if not _is_same(one, other):
                 raise RunError(
                     f"{function.name()}: result {index} of the C library differs from the "
-                    "graph's; it is not used"
+                    "graph's; the library is not used"
                 )
     if finite < SAMPLES // 4:
-        raise RunError(f"{function.name()}: {finite} of {SAMPLES} results are numbers: no proof")
+        raise RunError(f"{function.name()}: {finite} of {SAMPLES} results are finite: no proof")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Build what is missing; without a compiler say so. 0 if no graph failed."""
+    """Build the missing libraries, or report a missing compiler. Return 0 if no graph failed."""
     parser = FlagParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_flags(parser, ConfigFlags)
     flags = read_flags(ConfigFlags, parser.parse_args(argv))
@@ -160,7 +160,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _is_same(one: Array, other: Array) -> bool:
-    """Return True if two results agree in every bit, or are no numbers at the same places."""
+    """Return True if two results agree in every bit, or are NaN at the same places."""
     a, b = np.isnan(one), np.isnan(other)
     return np.array_equal(a, b) and one[~a].tobytes() == other[~b].tobytes()
 

@@ -1,7 +1,7 @@
-"""The door for text to a terminal, a pipe or a file: control characters are shown, not obeyed.
+"""Filter for text to a terminal, pipe or file: it shows control characters instead of sending them.
 
-A log, the bus, another host or a file's name may hold escape sequences: they would retitle a
-window, clear it or paint a verdict. In JSON what is written for one means the same character.
+A log, the bus, another host or a file name may contain escape sequences, which could rename a
+window, clear it or fake a verdict. In JSON, the replacement denotes the same character.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from collections.abc import Iterator
 from typing import IO, Any, Final, cast
 
 _CONTROL: Final = re.compile(
-    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 but tab and newline, DEL, C1
-    "\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"  # what turns or breaks a line
-    "\ud800-\udfff]"  # bytes of a file's name that are no UTF-8
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 except tab and newline, DEL, C1
+    "\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"  # characters that reverse or break a line
+    "\ud800-\udfff]"  # bytes of a file name that are not UTF-8
 )
 
 DRAWN: Final = "xrl-drawn"
@@ -26,7 +26,7 @@ _ALIKE: Final = {"█": "#", "±": "+-", "…": "...", "µ": "u", "°": "deg", "
 
 
 def cleaned(text: str) -> str:
-    r"""Return a text with each control character but tab and newline written as `\u001b`."""
+    r"""Return a text with each control character except tab and newline written as `\u001b`."""
     return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
@@ -36,16 +36,16 @@ def is_clean(text: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """Return a foreign text as a part of one line."""
+    """Return a text from outside as part of one line."""
     return cleaned(text).replace("\n", "\\n")
 
 
 class _Guarded:
-    """A stream whose writer prints plain text; Rich, which writes its own colours, passes by."""
+    """A stream that cleans printed text; Rich bypasses it, because it writes its own colours."""
 
     def __init__(self, stream: IO[str]) -> None:
         self.rich_proxied_file = stream
-        """What Rich's console writes to."""
+        """The stream that Rich's console writes to."""
         self._lost: OSError | None = None
 
     def write(self, text: str) -> int:
@@ -58,7 +58,7 @@ class _Guarded:
         return len(text)
 
     def flush(self) -> None:
-        """Flush, and raise what a writer passed over in silence, as argparse does."""
+        """Flush, and raise an error that the writer ignored, as argparse does."""
         if self._lost is not None:
             raise self._lost
         self.rich_proxied_file.flush()
@@ -69,7 +69,7 @@ class _Guarded:
 
 @contextlib.contextmanager
 def guarded_streams() -> Iterator[None]:
-    """Guard `print` and the error stream, and let a terminal draw what it can."""
+    """Guard `print` and the error stream, and replace characters that a terminal cannot draw."""
     codecs.register_error(DRAWN, _as_it_can)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -82,7 +82,7 @@ def guarded_streams() -> Iterator[None]:
 
 
 def _as_it_can(error: UnicodeError) -> tuple[str, int]:
-    """Replace what an encoding lacks, as a handler of `codecs`."""
+    """Replace characters that an encoding lacks; an error handler of `codecs`."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]

@@ -1,4 +1,4 @@
-"""Keys of a terminal, one by one; no keys without a terminal."""
+"""Reads single key presses from a terminal; without a terminal there are none."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _READ_MAX: Final = 256
 
 
 class Keyboard(Generic[K]):
-    """Waits, and returns early when a key is pressed; gives the terminal back at the end."""
+    """Waits, and returns early when a key is pressed; restores the terminal at the end."""
 
     def __init__(self, codes: Mapping[bytes, K]) -> None:
         self._codes = codes
@@ -33,7 +33,7 @@ class Keyboard(Generic[K]):
         return self._descriptor >= 0
 
     def __enter__(self) -> Self:
-        """Read keys one by one, if this is a terminal's foreground."""
+        """Read single keys, if this process is in the foreground of a terminal."""
         try:
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor) and _is_foreground(descriptor):
@@ -41,7 +41,7 @@ class Keyboard(Generic[K]):
                 tty.setcbreak(descriptor)
                 self._descriptor = descriptor
         except (OSError, ValueError, AttributeError, termios.error):
-            pass  # no stdin, or none that is a terminal
+            pass  # no stdin, or stdin is not a terminal
         return self
 
     def __exit__(
@@ -50,7 +50,7 @@ class Keyboard(Generic[K]):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal."""
         if self.present:
             with contextlib.suppress(OSError, termios.error):  # the terminal may be gone
                 if _is_foreground(self._descriptor):
@@ -58,7 +58,7 @@ class Keyboard(Generic[K]):
             self._descriptor = -1
 
     def wait(self, timeout_s: float) -> list[K]:
-        """Return the pressed keys, after a timeout at the latest."""
+        """Return the pressed keys, at the latest after a timeout, s."""
         if not self.present:
             time.sleep(timeout_s)
             return []
@@ -76,9 +76,9 @@ class Keyboard(Generic[K]):
         return presses
 
     def _set_cbreak(self) -> None:
-        """Read keys one by one again after a shell has reset the terminal (Ctrl-Z, then `fg`).
+        """Read single keys again after a shell has reset the terminal (Ctrl-Z, then `fg`).
 
-        No typed key is discarded: it may be the stop.
+        Typed keys are not discarded, because one may be the stop.
         """
         with contextlib.suppress(OSError, termios.error):
             is_by_line = termios.tcgetattr(self._descriptor)[3] & termios.ICANON
@@ -87,7 +87,7 @@ class Keyboard(Generic[K]):
 
 
 def _is_foreground(descriptor: int) -> bool:
-    """Return True if this process may change its terminal; a job in the background is stopped."""
+    """Return True if this process may change its terminal; a background job would be stopped."""
     return os.tcgetpgrp(descriptor) == os.getpgrp()
 
 
@@ -101,7 +101,7 @@ def is_hung_up(file: int | TextIO) -> bool:
 
 
 def understood(text: bytes, codes: Mapping[bytes, K]) -> tuple[list[K], bytes]:
-    """Split a terminal's bytes into keys and the start of an incomplete one."""
+    """Split a terminal's bytes into keys and the start of an incomplete key."""
     presses = []
     while text:
         for code, press in codes.items():
@@ -117,7 +117,7 @@ def understood(text: bytes, codes: Mapping[bytes, K]) -> tuple[list[K], bytes]:
 
 
 def typed_line(wait_s: float) -> str | None:
-    """Return the line that a person enters within a time, s.
+    """Return the line that a person enters within a timeout, s.
 
     Return None if no line is entered or there is no terminal, "" if the terminal is gone.
     """

@@ -1,4 +1,4 @@
-"""Solves for a stand from any configuration, or for the nearest one that the legs reach. Offline.
+"""Offline solver for a stand from any configuration, or for the nearest one within reach.
 
 Levenberg-Marquardt inside the joint limits, from several starts. If p_ref is out of reach, it ends
 at the nearest pose at which the legs still agree, and reports what limits it.
@@ -23,7 +23,7 @@ from shared.arrays import Array
 from shared.joints import JOINTS, N_JOINTS, N_LEG
 
 COLD_STEP_MAX = 0.5
-"""rad; longer than `STEP_MAX`, because here a step that does not reduce the cost is taken back."""
+"""rad; longer than `STEP_MAX`, because here a step that does not reduce the cost is undone."""
 EVALUATIONS_MAX = 60
 """Evaluations of the kinematics per start; from a bent stand the median is 8."""
 CLOSURE_WEIGHT = 10.0
@@ -42,7 +42,7 @@ POSE_ROWS = (
 
 
 class IkEnding(IntEnum):
-    """How a solve ended."""
+    """Ending of a solve."""
 
     CONVERGED = 0
     JOINT_LIMIT = 1
@@ -73,7 +73,7 @@ class Reach(NamedTuple):
 
 
 class ReachSolver(InverseKinematics):
-    """Inverse kinematics that starts anywhere."""
+    """Inverse kinematics that starts from any configuration."""
 
     _evaluations = 0
 
@@ -206,7 +206,7 @@ def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
     scale = max(float(np.abs(reach.error).max()), TOLERANCE)
     digits = max(2, 1 - math.floor(math.log10(scale)))
     misses = [
-        f"{name} {p_ref[row]:.{digits}f} {unit} wanted, "
+        f"{name} {p_ref[row]:.{digits}f} {unit} requested, "
         f"{p_ref[row] - reach.error[row]:.{digits}f} {unit}"
         for row, (name, unit) in sorted(enumerate(POSE_ROWS), key=lambda r: -abs(reach.error[r[0]]))
         if abs(reach.error[row]) >= 0.1 * scale

@@ -1,8 +1,9 @@
 """Tables and styled text for a terminal, a pipe or a file.
 
-Text of a log, of the bus or of another host is data: Rich's markup is taken from `marked` templates
-alone, and control characters are shown (`tools.guarded_streams`). A pipe or a file gets tables
-whole: as wide as they need, without frames and colours. A terminal folds what does not fit.
+Text from a log, the bus or another host is data: only `marked` templates are parsed for Rich's
+markup, and control characters are shown escaped (`tools.guarded_streams`). Tables for a pipe or a
+file are as wide as they need to be, without frames and colours. A terminal folds cells that do not
+fit.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from rich.text import Text
 from tools.guarded_streams import cleaned, is_clean
 
 WIDE: Final = 10_000
-"""Columns of a pipe or a file."""
+"""Width of a pipe or a file, columns."""
 _FOLDED_MIN: Final = 8
-"""Columns that a folded column of text keeps at least."""
+"""Minimum width of a folded text column, characters."""
 
 _HOLE: Final = "\0"
 _FIELD: Final = re.compile(r"\{(?:![rs])?(?::[^{}]*)?\}")
 
 
 def marked(template: str, *values: object) -> Text:
-    """Return a text in which the template alone is markup."""
+    """Return a text in which only the template is parsed as markup."""
     whole = Text()
     given = zip(_FIELD.findall(template), values, strict=True)
     frame = Text.from_markup(_FIELD.sub(_HOLE, template), emoji=False)
@@ -48,12 +49,12 @@ def marked(template: str, *values: object) -> Text:
         part.right_crop(1)
         whole.append_text(part)
         whole.append_text(filling)
-    next(given, None)  # else a value too many would be left out silently
+    next(given, None)  # raises if there is a value too many
     return whole
 
 
 class Console(rich.console.Console):
-    """Rich's console, for which a plain string is data."""
+    """Rich's console, which prints plain strings as they are, without parsing markup."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{"markup": False, "emoji": False, **options})
@@ -61,13 +62,13 @@ class Console(rich.console.Console):
             self.width = WIDE
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return a plain string as text, its control characters shown."""
+        """Return a plain string as text, with its control characters escaped."""
         return super().render_str(cleaned(text), **options)
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Yield the segments of anything printable, whole and without foreign control."""
+        """Yield the segments of a renderable, with whole tables and escaped control characters."""
         segments = super().render(renderable, options)
         if isinstance(renderable, Table):
             self._let_fit(renderable, options or self.options)
@@ -82,11 +83,11 @@ class Console(rich.console.Console):
                 yield Segment(cleaned(segment.text), segment.style)
 
     def on_broken_pipe(self) -> None:
-        """Leave it to the command line: Rich itself would exit with 1."""
+        """Raise, so that the command line handles it: Rich itself would exit with 1."""
         raise BrokenPipeError
 
     def _let_fit(self, table: Table, options: ConsoleOptions) -> None:
-        """Fold a table's cells where they would be cut; take its frame off in a pipe or a file."""
+        """Fold cells that would be cut off; remove the frame for a pipe or a file."""
         if not self.is_terminal:
             table.box, table.pad_edge = None, False
         wide = options.update(max_width=WIDE)
@@ -107,7 +108,7 @@ class Console(rich.console.Console):
 def renewed(
     console: Console, *, transient: bool = False
 ) -> Iterator[Callable[[RenderableType], None]]:
-    """Give what shows the newest of something: in its place on a terminal, else below the last."""
+    """Yield a function that shows the newest renderable, in place on a terminal, else appended."""
     if not console.is_terminal:
 
         def show(shown: RenderableType) -> None:

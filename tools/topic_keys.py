@@ -1,7 +1,7 @@
-"""Keys of the bus by the names that a person types, such as `joint/*/state`.
+"""Bus keys by the names that a person types, such as `joint/*/state`.
 
-A name is what follows `xrl/<robot>/` in a key. In a name `*` stands for any part of one section
-(`joint/*/state`), `**` for any number of sections.
+A name is the part of a key after `xrl/<robot>/`. In a name, `*` stands for any part of one section
+(`joint/*/state`), and `**` for any number of sections.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PARTS: Final = {"**": ".*", "*": "[^/]*"}
 
 
 class TopicKey(NamedTuple):
-    """A key of a robot's bus."""
+    """One key on a robot's bus."""
 
     topic: Topic
     module: str
@@ -29,12 +29,12 @@ class TopicKey(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name below the robot's, such as `joint/knee_left/state`."""
+        """The key without `xrl/<robot>/`, such as `joint/knee_left/state`."""
         return self.topic.name.replace("*", self.module)
 
 
 def every_key() -> list[TopicKey]:
-    """Return every key but those of batches, whose messages have keys of their own, in order."""
+    """Return every key in order, except those of batches, whose messages have their own keys."""
     return [
         TopicKey(topic, module)
         for topic in topics.TOPICS
@@ -50,14 +50,14 @@ def _is_named(key: TopicKey, name: str) -> bool:
 
 
 def keys_named(names: Sequence[str], left_out: Collection[Topic] = ()) -> list[TopicKey]:
-    """Return the keys that have one of these names, in the order of the table of topics."""
+    """Return the keys that match one of these names, in the order of the table of topics."""
     known = every_key()
     for name in names:
         if not any(_is_named(key, name) for key in known):
             rows = ", ".join(topic.name for topic in topics.TOPICS)
             raise RunError(
-                f"{name}: no topic is so named; there are {rows}; * stands for a part between "
-                "slashes, ** for slashes too"
+                f"{name}: no topic has this name; the topics are {rows}; * stands for a part "
+                "between slashes, ** for slashes too"
             )
     if not names:
         return [key for key in known if key.topic not in left_out]
@@ -65,7 +65,7 @@ def keys_named(names: Sequence[str], left_out: Collection[Topic] = ()) -> list[T
 
 
 def sender_of(topic: Topic, module: str = "") -> str:
-    """Return the service that puts a topic; "" if tools do, on any host."""
+    """Return the service that publishes a topic, or "" if tools on any host publish it."""
     if topic.writers == ("*",):
         return module
     return topic.writers[0] if len(topic.writers) == 1 and topic.writers[0] in SERVICES else ""

@@ -1,1 +1,1 @@
-"""The harness service: six leg forces in, the operator's wrench out (docs/law.md#harness)."""
+"""Harness service: six leg forces in, the operator's wrench out (docs/law.md#harness)."""

@@ -28,7 +28,7 @@ def made(config: RobotConfig, run_dir: Path) -> SensorService:
     harness = config.harness
     sensor = sensor_of(config, harness, SampleAssembler(), run_dir)
     law = WrenchFilter(harness)
-    # one that was started by hand keeps no zero: nothing would ever remove it
+    # a service started by hand stores no zero, because nothing would remove the file
     zero = ZeroFile(run_dir) if FLEET_VARIABLE in os.environ else None
 
     def loop_on(session: Session) -> HarnessLoop:

@@ -1,16 +1,16 @@
-"""Computes a valid wrench from leg forces: tare, low-pass, saturation, staleness.
+"""Wrench and its validity from leg forces: tare, low-pass, saturation, staleness.
 
 Pure: state, time and sample in, next state and reading out (docs/law.md#harness).
 
-- *Tare*: the mean leg forces over `tare_s` become the zero. A saturated cell, a gap
-  longer than `stale_ms`, or forces that moved too much restart it. Nothing is valid until it is
-  done. A load at rest cannot be distinguished from a zero.
-- *Low-pass*: first order at `low_pass_hz`, exact for any time between samples. So after a gap the
-new sample's weight grows with the gap.
+- *Tare*: the mean leg forces over `tare_s` become the zero. A saturated cell, a gap longer than
+  `stale_ms`, or forces that move too much restart the tare. No wrench is valid until it is done. A
+  load at rest cannot be distinguished from a zero.
+- *Low-pass*: first order at `low_pass_hz`, exact for any time between samples. The weight of a
+  new sample therefore grows with the gap before it.
 - *Saturation*: a sample with any raw leg force at or beyond `leg_force_max` is not used.
 - *Staleness*: a sample is fresh while its age is at most `stale_ms`.
-- *Frozen*: a cell that is alive has noise. Nothing is valid while one has read the same number for
-  `FROZEN_NS`: an amplifier that hangs, a wire that is off, a bus that repeats its last frame.
+- *Frozen*: a working cell has noise. No wrench is valid while a cell has repeated its reading for
+  `FROZEN_NS`: the amplifier hangs, a wire is off, or the bus repeats its last frame.
 - A sample with a number that is not finite is refused and counted.
 """
 
@@ -34,20 +34,20 @@ Array = npt.NDArray[np.float64]
 _ZERO: Final[Array] = np.zeros(N_LEGS)
 
 FROZEN_NS: Final = 100 * NS_PER_MS
-"""ns, 25 samples."""
+"""ns; 25 samples."""
 NEVER_NS = -1
-"""Stands for the time of something that has not happened."""
+"""Time of an event that has not happened."""
 
 
 TARE_DEVIATION_MAX: Final = 3.0
-"""Largest standard deviation of a leg force in a tare, N: several times a cell's noise, and
-less than a hand on the harness makes, or a robot that sways."""
+"""Maximum standard deviation of a leg force in a tare, N: several times a cell's noise, and less
+than a hand on the harness or a swaying robot causes."""
 
 
 class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """All that the filter remembers; its arrays are never written to.
+    """State of the filter; its arrays are never modified.
 
-    As made, it is that at power-up: waiting for the first sample of the tare.
+    The default is the state at power-up, which waits for the first sample of the tare.
     """
 
     tare: Tare = Tare.RUNNING
@@ -57,15 +57,15 @@ class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     tare_first: Array = _ZERO
     """(6,) raw leg forces of that sample, N: near the mean, so that squares stay small."""
     tare_sum: Array = _ZERO
-    """(6,) sum of the raw leg forces since then, less those of the first, N."""
+    """(6,) sum of the raw leg forces since then, minus `tare_first`, N."""
     tare_squares: Array = _ZERO
-    """(6,) sum of the squares of the same, N^2."""
+    """(6,) sum of the squares of these differences, N^2."""
     offset: Array = _ZERO
     """(6,) leg forces that count as zero, N."""
     wrench: Array = _ZERO
     """(6,) last good wrench after the low-pass, [N; N m]."""
     wrench_t_ns: int = NEVER_NS
-    """Time of the last sample that went into it."""
+    """Time of the last sample in that wrench."""
     sample_t_ns: int = NEVER_NS
     """Time of the newest finite sample; `NEVER_NS` before the first."""
     raw: Array = _ZERO
@@ -104,7 +104,7 @@ def start_tare(state: FilterState) -> FilterState:
 
 
 class WrenchFilter:
-    """The constants of the filter and its one step."""
+    """Constants of the filter, and its step."""
 
     def __init__(self, config: HarnessConfig) -> None:
         """Derive the constants; ConfigError if the sensor's geometry is singular."""
@@ -118,7 +118,7 @@ class WrenchFilter:
     def step(
         self, state: FilterState, now_ns: int, forces: Vector6 | None
     ) -> tuple[FilterState, FilteredWrench]:
-        """Take the newest leg forces, N, or None if there are none, and say what holds now."""
+        """Add the newest leg forces, N, or None without a sample; return state and reading."""
         if forces is not None:
             state = self._add(state, now_ns, forces)
         seen = state.sample_t_ns != NEVER_NS

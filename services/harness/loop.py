@@ -19,7 +19,7 @@ from shared.run_directory import live_dir, mapped
 
 
 class HarnessLoop(SensorLoop[Vector6, Wrench]):
-    """One cycle of the service; begins with a tare, or with the zero of the service before it."""
+    """Loop of the service; starts with a tare, or with the zero of the service before it."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
 
     @property
     def refused(self) -> int:
-        """Samples that were not finite."""
+        """Number of samples that were not finite."""
         return self.state.refused
 
     def message(self, now_ns: int, sample: Vector6 | None) -> Wrench:
@@ -66,35 +66,35 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
 
 
 _KEPT: Final = struct.Struct(f"<{N_LEGS}dI")
-"""The leg forces, N, and a checksum of this boot and them: a kill may come amid a write."""
+"""Leg forces, N, and a checksum over boot id and forces, because a kill may interrupt a write."""
 _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 def zero_path(run_dir: Path) -> Path:
-    """Return where the zero is kept."""
+    """Return the path of the stored zero."""
     return live_dir(run_dir) / "harness.zero"
 
 
 class ZeroFile:
-    """The last zero of this fleet's harness."""
+    """File with the last zero of this fleet's harness."""
 
     def __init__(self, run_dir: Path, boot: bytes | None = None) -> None:
-        """Open it, or make it; the directory is there. `boot` stands for this boot of the host.
+        """Open or create the file; the directory must exist. `boot` identifies the host's boot.
 
         Raises:
-            FleetError: it cannot be made.
+            FleetError: the file cannot be created.
         """
         self._memory = mapped(zero_path(run_dir), _KEPT.size)
         self._boot = _BOOT.read_bytes() if boot is None else boot
 
     def read(self) -> Array | None:
-        """Return the leg forces (6,) that count as zero, N; None: nothing has been tared."""
+        """Return the leg forces (6,) that count as zero, N; None if no tare is stored."""
         *forces, checksum = _KEPT.unpack(self._memory[:])
         offset = np.array(forces)
         return offset if checksum == self._checksum(offset) else None
 
     def write(self, offset: Array | None) -> None:
-        """Keep a zero (6,), N; None: a tare that was asked for is not done."""
+        """Store a zero (6,), N; None clears it while a requested tare runs."""
         if offset is None:
             self._memory[:] = bytes(_KEPT.size)
         else:

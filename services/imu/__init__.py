@@ -1,1 +1,1 @@
-"""The IMU service: the sensor's orientation in, which way is up out."""
+"""IMU service: the sensor's orientation in, the up direction out."""

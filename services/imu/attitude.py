@@ -1,12 +1,12 @@
-"""Computes the unit vector up in torso axes from the IMU's orientation. Pure.
+"""Unit vector up in torso axes, from the IMU's orientation. Pure.
 
-A quaternion that turns sensor axes into axes whose z is up has, as the third row of its rotation,
-up in sensor axes; the heading, which is wrong beside steel, drops out. The mounting
-turns sensor axes into torso axes.
+The quaternion turns sensor axes into axes whose z is up. The third row of its rotation is thus up
+in sensor axes; the heading, which is wrong near steel, drops out. The mounting turns sensor axes
+into torso axes.
 
-A sample whose quaternion is not of unit length is refused and counted: then the frames have another
-meaning. A sensor that is alive has noise: nothing is valid while its samples have been the same for
-`FROZEN_NS`.
+A sample whose quaternion is not of unit length is refused and counted, because its frames have
+another meaning. A working sensor has noise, so no reading is valid once samples have been the same
+for `FROZEN_NS`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from shared.config.sections import ImuConfig
 from shared.robot.frames import rotated, torso_rotation
 
 UNIT_TOLERANCE: Final = 0.02
-"""How far a quaternion's length may be from 1; rounding to 2^-15 makes 6e-5."""
+"""Maximum deviation of a quaternion's length from 1; rounding to 2^-15 causes 6e-5."""
 
 
 FROZEN_NS: Final = 250 * NS_PER_MS
-"""ns; longer than for a load cell, because the words are coarser: 3e-5 and 2e-3 rad/s."""
+"""ns; longer than for a load cell, because an IMU's readings are coarser: 3e-5 and 2e-3 rad/s."""
 
 
 class AttitudeReading(NamedTuple):
@@ -36,14 +36,14 @@ class AttitudeReading(NamedTuple):
     rate: Vector3
     """rad/s, torso axes."""
     valid: bool
-    """True if fresh, and the sensor says that it knows; otherwise the numbers are the last good
-    ones."""
+    """True if fresh, not frozen, and valid according to the sensor; otherwise the numbers are the
+    last good ones."""
     age_ns: int
     """Age of the newest sample; -1 before the first."""
 
 
 class AttitudeLaw:
-    """The mounting, the last good sample and its age."""
+    """Mounting, last good sample and its age."""
 
     def __init__(self, config: ImuConfig) -> None:
         self.refused = 0
@@ -58,7 +58,7 @@ class AttitudeLaw:
         self._changed_ns = 0
 
     def step(self, now_ns: int, sample: ImuSample | None) -> AttitudeReading:
-        """Take the newest sample, or None if there is none, and say what holds now."""
+        """Add the newest sample, or None without a sample; return the reading."""
         if sample is not None and not _is_unit(sample.quaternion):
             self.refused += 1
             sample = None

@@ -1,4 +1,4 @@
-"""The loop of the IMU service: read, say which way is up, publish."""
+"""The loop of the IMU service: read, compute the up direction, publish."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.can.sensor_loop import Sensor, SensorLoop
 
 
 class ImuLoop(SensorLoop[ImuSample, Attitude]):
-    """One cycle of the service."""
+    """Loop of the service."""
 
     def __init__(
         self, sensor: Sensor[ImuSample], law: AttitudeLaw, publisher: Outbox[Attitude]
@@ -20,7 +20,7 @@ class ImuLoop(SensorLoop[ImuSample, Attitude]):
 
     @property
     def refused(self) -> int:
-        """Samples whose quaternion was not of unit length."""
+        """Number of samples whose quaternion was not of unit length."""
         return self._law.refused
 
     def message(self, now_ns: int, sample: ImuSample | None) -> Attitude:

@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument(
         "--readonly",
         action="store_true",
-        help="listen to the drive and publish, and send it nothing: for bring-up",
+        help="read the drive and publish its state, without commanding it: for bring-up",
     )
     arguments = parser.parse_args()
     module: str = arguments.module
@@ -61,7 +61,7 @@ def main() -> int:
         drive = open_drive(robot, module, arguments.run_dir, read_only=arguments.readonly)
         rearm_guard = None if arguments.readonly else RearmGuard(arguments.run_dir, module)
         if rearm_guard is not None:
-            rearm_guard.stop_on(signal.SIGUSR1)  # where the disk with its file is gone
+            rearm_guard.stop_on(signal.SIGUSR1)  # also works when the file's disk is gone
         last_state = LastState.NOTHING if rearm_guard is None else rearm_guard.read()
         neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
         loop = JointLoop(

@@ -43,21 +43,21 @@ class CycleResult(msgspec.Struct, gc=False, frozen=True):
     tau: Pair
     """Joint torque for the drive, N m, after the limiter."""
     event: JointEvent | None
-    """The change of mode in this cycle, if there was one."""
+    """Change of mode in this cycle, or None."""
 
 
 class ControllerState(msgspec.Struct, kw_only=True):
-    """What changes from cycle to cycle in `JointController`."""
+    """State of `JointController` that changes from cycle to cycle."""
 
     estimate: JointEstimate
     failsafe: Failsafe = msgspec.field(default_factory=Failsafe)
     trips: JointTrips = msgspec.field(default_factory=JointTrips)
     initial_torque: Pair | None = None
-    """Torque of a drive that was found armed, N m: it is taken over without a step."""
+    """Torque of a drive that was found armed, N m; it is taken over without a step."""
     takeover_offset: Pair = (0.0, 0.0)
-    """Torque of the drive beyond the law's when the service resumed after a gap, N m."""
+    """Drive's torque minus the law's when the service resumed after a gap, N m."""
     lately: Lately = NOTHING_YET
-    """What the commands that were obeyed have done, up to the newest."""
+    """Drift and energy of the accepted commands, up to the newest."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0
@@ -66,7 +66,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """Joint torque of the last cycle (phi, theta), N m."""
     cycle: int = 0
     late: int = 0
-    """Cycles that came later than twice the period after the one before."""
+    """Cycles that came more than two periods after the previous one."""
     clock: SampleClock = msgspec.field(default_factory=SampleClock)
     events: int = 0
     states: int = 0
@@ -75,15 +75,15 @@ class ControllerState(msgspec.Struct, kw_only=True):
 
 
 class JointController:
-    """The control law of one module; all that changes from cycle to cycle is in `ControllerState`.
+    """Control law of one module; everything that changes between cycles is in `ControllerState`.
 
     Attributes:
         timing: times of the age rule.
-        heat: estimates how warm the module's motors are.
+        heat: estimate of the motors' temperatures.
     """
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Take the module's limits and gains."""
+        """Read the module's limits and gains."""
         service = config.joint_service
         self.timing = timing_of(config)
         self._envelope = Envelope(config, module)
@@ -119,14 +119,14 @@ class JointController:
         """Run one cycle: estimate, age rule, mode, setpoint, limits.
 
         Args:
-            s: the module's state, which changes.
+            s: the module's state, updated in place.
             now_ns: this module's monotonic clock.
-            reading: the drive's newest sample; None if none came in time.
-            command: the newest command, if one came since the last cycle.
-            estop: the emergency stop is engaged.
-            flushing: the service was frozen and the link's buffer is read out first: samples may
-                jump from the joint's old position to its present one.
-            near: what is known of the other modules on this host.
+            reading: the drive's newest sample, or None if it did not arrive in time.
+            command: the newest command since the last cycle, or None.
+            estop: True if the emergency stop is engaged.
+            flushing: True while the link's buffer is read out after the service was frozen; samples
+                may jump from the joint's old position to its present one.
+            near: view of the other modules on this host.
         """
         self._count(s, now_ns)
         drive = self._estimated(s, reading, flushing=flushing)
@@ -151,15 +151,15 @@ class JointController:
         return CycleResult(s.tau, event)
 
     def resume(self, s: ControllerState, now_ns: int, carried: Pair) -> Pair:
-        """Continue from the torque that the drive carries, after a gap without commands to it.
+        """Continue from the drive's torque after a gap without commands to it.
 
         The difference to the law's torque fades over `joint_service.blend_ms`. Returns the joint
-        torque of this cycle, N m: the carried one, within the differential's limit.
+        torque of this cycle, N m: the drive's, within the differential's limit.
 
         Args:
-            s: the module's state, which changes.
-            now_ns: this module's monotonic clock, of the cycle just run.
-            carried: joint torques (phi, theta) of the drive now, N m.
+            s: the module's state, updated in place.
+            now_ns: this module's monotonic clock at the cycle just run.
+            carried: the drive's present joint torques (phi, theta), N m.
         """
         wanted = pd_law.torque(s.law.current, s.estimate.q, s.estimate.v)
         s.takeover_offset = (carried[0] - wanted[0], carried[1] - wanted[1])
@@ -178,7 +178,7 @@ class JointController:
     def state(self, s: ControllerState, now_ns: int) -> JointState:
         """Return the module's state message.
 
-        Its stamp is the arrival of the drive's sample: a command made from an old sample is old.
+        Its stamp is the arrival of the drive's sample, so a command made from an old sample is old.
         """
         failsafe, estimate, command = s.failsafe, s.estimate, s.failsafe.command
         s.states += 1
@@ -226,19 +226,19 @@ class JointController:
     def _estimated(
         self, s: ControllerState, reading: DriveReading | None, *, flushing: bool
     ) -> Event:
-        """Update the joint's estimate; return what happened to the drive."""
+        """Update the joint's estimate; return the drive's event."""
         if reading is None:
             return _NONE
         armed = s.failsafe.mode is not _DISARMED and not flushing
-        event = s.estimate.take(reading, armed=armed, flushing=flushing)
+        event = s.estimate.process(reading, armed=armed, flushing=flushing, tau=s.tau)
         if reading.torque is not None:
             s.initial_torque = joint_torque(reading.torque, self._gear_ratio)
         return event
 
     def _offer(self, s: ControllerState, now_ns: int, command: JointCommand) -> None:
-        """Let the age rule and the envelope decide about a command."""
+        """Check a command against the age rule and the envelope."""
         tracked = s.failsafe.command if s.failsafe.mode is _TRACK else None
-        lately = self._envelope.lately(command, tracked, s.lately, s.estimate.v, now_ns)
+        lately = self._envelope.accumulated(command, tracked, s.lately, s.estimate.v, now_ns)
         outside = self._envelope.judge(
             command,
             tracked,
@@ -256,7 +256,7 @@ class JointController:
         """Return the trip of this cycle; only a module in TRACK trips."""
         if s.failsafe.mode is _TRACK:
             return s.trips.judge(now_ns, s.tau, s.estimate.v, self._trip_limits)
-        s.trips.rest(s.tau)
+        s.trips.reset(s.tau)
         return _NONE
 
     def _enter(self, s: ControllerState, now_ns: int, before: Mode) -> None:
@@ -273,20 +273,20 @@ class JointController:
         command = s.failsafe.command
         accepted = s.failsafe.outside is Outside.NOTHING
         if command is not None and accepted and s.failsafe.is_fresh(now_ns, self.timing):
-            k_p, k_d = command.k_p, command.k_d  # as soft as the other five
+            k_p, k_d = command.k_p, command.k_d  # as soft as the other five modules
         carried = pd_law.take_over(q, v, s.initial_torque, k_p, k_d)
         law.start(s.law, s.failsafe.mode, now_ns, carried)
-        s.tau = s.initial_torque  # the limiter takes it for the last torque
+        s.tau = s.initial_torque  # the limiter starts from it
 
     def _warm(self, s: ControllerState, now_ns: int, reading: DriveReading | None) -> None:
-        """Update the estimate of the module's heat."""
+        """Update the estimate of the motors' temperatures."""
         fet = motor = None
         if reading is not None:
             fet, motor = reading.fet_celsius, reading.motor_celsius
         self.heat.advance(s.heat, now_ns, motor_torque(s.tau, self._gear_ratio), fet, motor)
 
     def _wanted(self, s: ControllerState, now_ns: int, setpoint: Setpoint) -> Pair:
-        """Return the law's torque, N m, with the rest of a take-over's difference."""
+        """Return the law's torque, N m, plus what is left of the take-over's offset."""
         wanted = pd_law.torque(setpoint, s.estimate.q, s.estimate.v)
         if s.takeover_offset == pd_law.ZERO:
             return wanted

@@ -3,9 +3,9 @@
 q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N, in turns at the motors. Power is the
 same on both sides, so tau_1 = (tau_theta + tau_phi) / 2N, tau_2 = (tau_theta - tau_phi) / 2N.
 
-The last step before the drive bounds the torque and its rate. In order: a one-sided spring at the
-joint's soft stop, finite, the rate, and last the torque diamond
-|tau_phi| + |tau_theta| <= tau_module_max, which nothing may exceed. Pure.
+The last step before the drive bounds the torque and its rate, in this order: a one-sided spring at
+the soft stop, a check for finite values, the rate limit, and last the torque diamond |tau_phi| +
+|tau_theta| <= tau_module_max, which nothing may exceed. Pure.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: TorqueLimits) -> Pa
     """Return the torque that may go to the drive, N m.
 
     Args:
-        tau: wanted (tau_phi, tau_theta), N m; may be anything, also NaN.
+        tau: requested (tau_phi, tau_theta), N m; may be anything, also NaN.
         q: measured (phi, theta), rad.
-        tau_last: what went out in the last cycle, N m.
+        tau_last: torque sent in the last cycle, N m.
         limits: the module's limits.
     """
     phi = tau[0] + _soft_stop(q[0], limits.phi, limits.soft_stop_k_p)
@@ -94,7 +94,7 @@ def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: TorqueLimits) -> Pa
 def limit_differential(tau: Pair, tau_module_max: float) -> Pair:
     """Clip each motor's torque: |tau_phi + tau_theta| and |tau_theta - tau_phi| <= max.
 
-    Together they are docs/law.md (4).
+    Together these bounds are docs/law.md (4).
     """
     total = clamp(tau[1] + tau[0], -tau_module_max, tau_module_max)
     difference = clamp(tau[1] - tau[0], -tau_module_max, tau_module_max)

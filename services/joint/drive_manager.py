@@ -1,8 +1,8 @@
-"""One cycle of a module's service without any I/O: the controller and the care of its drive.
+"""One cycle of a module's service without any I/O: runs the controller and manages its drive.
 
-It arms the drive, takes over a drive that holds from an earlier service, idles a drive that
-disarmed, and chooses between torques and targets of the onboard loop. The loop sends its command to
-a real drive, lockstep to an emulated one. Pure.
+The manager arms the drive, takes over a drive that still holds from an earlier service, idles a
+drive that disarmed, and chooses between torques and targets for the onboard loop. The joint loop
+sends its command to a real drive, and in lockstep to an emulated one. Pure.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from shared.config.robot_config import RobotConfig
 ARM_EVERY_NS: Final = 500 * NS_PER_MS
 """Time between two attempts to arm while DISARMED, ns."""
 FORGET_EVERY_NS: Final = 150 * NS_PER_MS
-"""Time from idling the drive to the command to forget its zero, and to the next one until the drive
-shows that it has none: a heartbeat shows first that both axes are idle. An armed one would jump."""
+"""Time from idling the drive to the command to clear its zero, and between repetitions until it is
+cleared, ns. A heartbeat must first show that both axes are idle: an armed axis would jump."""
 IDLE_EVERY_NS: Final = 500 * NS_PER_MS
-"""Time between two idle commands to a drive of which one axis disarmed: its sibling keeps its
+"""Time between two idle commands to a drive with one disarmed axis, ns; the other axis keeps its
 torque."""
 GAP_NS: Final = 20 * NS_PER_MS
-"""Time without a cycle after which the service counts as frozen: its drive ran without commands."""
+"""Time without a cycle after which the service was frozen and its drive had no commands, ns."""
 LISTEN_NS: Final = 10 * NS_PER_MS
-"""Time of reading after that before it sends: the messages in the link's buffer are old."""
+"""Time after such a gap in which the service only reads, ns: buffered messages are old."""
 ARM_TRIES: Final = 10
-"""A drive that has not armed by then needs a person."""
+"""Maximum number of requests to arm; after that a person must find the cause."""
 
 
 class DriveCommand(Enum):
@@ -51,7 +51,7 @@ class DriveCommand(Enum):
 
 
 class ArmingInhibit(Enum):
-    """Why a drive is not armed; the loop puts it into words."""
+    """Reason why a drive is not armed; the loop has the text for the log."""
 
     NONE = 0
     UNZEROED = 1
@@ -60,11 +60,11 @@ class ArmingInhibit(Enum):
     LOST_TORQUE = 4
     """The drive lost torque after it held the robot; a person must request re-arming."""
     WAITING = 5
-    """The drive holds by its own loop; it is taken over once a planner is there."""
+    """The drive holds with its own loop; the service takes it over once a planner runs."""
     FAILED = 6
-    """The drive has errors: they are cleared, and it is armed if they stay away until then."""
+    """The drive has errors: the service clears them, and arms it later if they stay away."""
     UNACKNOWLEDGED = 7
-    """Its CAN bus carries no frame: nobody is there to acknowledge one."""
+    """Its CAN bus carries no frame, because no node acknowledges any."""
 
 
 class DriveAction(msgspec.Struct, gc=False, frozen=True):
@@ -97,25 +97,25 @@ _NO_INHIBIT: Final = ArmingInhibit.NONE
 
 
 class Phase(Enum):
-    """Relation of this service to the power of its drive."""
+    """Progress of this service in taking charge of its drive."""
 
     NEW = 0
-    """It has not acted yet: if the drive is armed, another service armed it."""
+    """The service has not acted yet: if the drive is armed, another service armed it."""
     HOLDING = 1
-    """The drive was found armed, and is not taken over yet."""
+    """The drive was found armed, and has not been taken over yet."""
     OURS = 2
-    """It has tried to arm the drive, or has taken it over."""
+    """The service has tried to arm the drive, or has taken it over."""
 
 
 _HOLDING, _OURS = Phase.HOLDING, Phase.OURS
 
 
 class DriveManagerState(msgspec.Struct, kw_only=True):
-    """All that changes from cycle to cycle in `DriveManager`."""
+    """State of `DriveManager` that changes from cycle to cycle."""
 
     controller: ControllerState
     gains: DriveGains = msgspec.field(default_factory=DriveGains)
-    """Gains that the drive has."""
+    """The drive's present gains."""
     phase: Phase = Phase.NEW
     estop: bool = False
     arm_at_ns: int = 0
@@ -123,15 +123,15 @@ class DriveManagerState(msgspec.Struct, kw_only=True):
     tries: int = 0
     """Attempts to arm the drive; a take-over counts as one."""
     forgets: bool = False
-    """The drive's zero is to be forgotten when its position is lost."""
+    """True if the drive's zero must be cleared when its position is lost."""
     forget_at_ns: int = 0
-    """The next command to forget it; 0: the drive was not idled yet."""
+    """Time of the next command to clear it, ns; 0 until the drive was idled."""
     forgot: bool = False
     target: MotorTarget | None = None
     """The last target sent to the drive."""
     last_cycle_ns: int = 0
     listen_until_ns: int = 0
-    """End of flushing the link after a gap; 0: no gap."""
+    """End of flushing the link after a gap, ns; 0 without a gap."""
     last_state: LastState = LastState.NOTHING
     """For the next service, in case this one dies now."""
 
@@ -141,8 +141,8 @@ class DriveManager:
 
     Attributes:
         controller: the control law.
-        state: all that changes from cycle to cycle. A snapshot is a copy of it
-            (`shared.state.copied`), and another manager that gets the copy continues bit for bit.
+        state: everything that changes from cycle to cycle. A snapshot is a copy of it
+            (`shared.state.copied`); another manager that gets the copy continues bit for bit.
         bus: name of the module's CAN bus.
         onboard: True if the motors' own loops hold the module.
     """
@@ -150,7 +150,7 @@ class DriveManager:
     def __init__(
         self, config: RobotConfig, name: str, last_state: LastState = LastState.NOTHING
     ) -> None:
-        """Take the last state of the service before this one; start DISARMED."""
+        """Start DISARMED, with the last state of the previous service."""
         self.controller = JointController(config, name)
         self.bus = config.module_named(name).bus
         self._fallback = DriveFallback(config, name)
@@ -175,7 +175,7 @@ class DriveManager:
 
     @property
     def leaves_holding(self) -> bool:
-        """True if the drive goes on holding by its own loop when the service ends now."""
+        """True if the drive keeps holding with its own loop when the service ends now."""
         s = self.state
         mode, lost = s.controller.failsafe.mode, s.controller.cause == Cause.DRIVE_LOST
         holds = mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP) or (mode is Mode.FAULT and lost)
@@ -236,7 +236,7 @@ class DriveManager:
         return DriveAction(result.event, out, torque, target, inhibit or _NO_INHIBIT)
 
     def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
-        """Return the cycle's result with the torque that the drive carried without commands."""
+        """Return the cycle's result, continued from the drive's torque without commands."""
         s = self.state
         estimate, carried = s.controller.estimate, tau_before
         if s.target is not None:
@@ -250,7 +250,7 @@ class DriveManager:
     def _in_fault(self, now_ns: int) -> DriveCommand:
         """Return the command to the drive of a module in FAULT.
 
-        A lost drive that may hold by its own loop gets no command: when the link comes back it
+        A lost drive that may hold with its own loop gets no command. When the link comes back it
         still holds, unless one of its axes lost torque meanwhile. Any other drive goes idle.
         """
         s = self.state
@@ -264,12 +264,12 @@ class DriveManager:
         return DriveCommand.NOTHING
 
     def _must_forget(self, now_ns: int) -> bool:
-        """Return True if an idle drive is to forget its zero now: it may lack turns."""
+        """Return True if an idle drive's zero must be cleared now, because turns may be missing."""
         s, estimate = self.state, self.state.controller.estimate
         if not estimate.turns_lost or estimate.status not in _NOT_ARMED or now_ns < s.forget_at_ns:
             return False
         if s.forget_at_ns == 0 and s.controller.failsafe.mode is _FAULT:
-            return False  # it is not idle yet
+            return False  # the drive is not idle yet
         if s.forgot and estimate.status is DriveStatus.UNZEROED:
             return False
         s.forget_at_ns, s.forgot = now_ns + FORGET_EVERY_NS, True
@@ -278,11 +278,11 @@ class DriveManager:
     def _found_armed(self, now_ns: int, reading: DriveReading) -> DriveReading:
         """Return the reading of a drive that was found armed.
 
-        A drive that holds by its own loop after its service died is taken over as it is: once its
-        torques are known, and with the gains on which the other five hold. Until a planner sends
-        those it gets no command: a knee taken over with stand gains, beside one that holds on soft
-        gains, rolled the torso, and the robot tipped while the hand led on. Without the onboard
-        loop an armed drive is not ours.
+        A drive that holds with its own loop after its service died is taken over once its torques
+        are known and a planner sends the gains on which the other five hold. Until then it gets no
+        command: a knee taken over with stand gains, beside a knee on soft gains, rolled the torso,
+        and the robot tipped while the hand led. Without the onboard loop, an armed drive is not
+        this service's and reads as IDLE.
         """
         s = self.state
         if not self.onboard:
@@ -295,9 +295,9 @@ class DriveManager:
         return reading
 
     def _is_to_be_taken_over(self, reading: DriveReading | None) -> bool:
-        """Return True if the drive may hold by its own loop: it is taken over before a stop.
+        """Return True if the drive may hold with its own loop, and so is taken over before a stop.
 
-        An emergency stop needs the drive's torque to start from.
+        An emergency stop starts from the drive's torque.
         """
         if not self.onboard or self.state.controller.failsafe.mode is not _DISARMED:
             return False
@@ -311,7 +311,7 @@ class DriveManager:
         return LastState.DAMP if mode is Mode.DAMP or s.estop else LastState.HELD
 
     def _inhibit(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
-        """Return what inhibits arming now; None if it is not known yet."""
+        """Return what inhibits arming now, or None if that is not known yet."""
         s = self.state
         if reading is None or reading.status is DriveStatus.LOST:
             return None

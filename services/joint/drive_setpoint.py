@@ -1,9 +1,9 @@
-"""The local law split once more, between joint service and drive (docs/drives.md). Pure.
+"""Split of the local law between joint service and drive (docs/drives.md). Pure.
 
-Each motor's own loop holds a module's mean stiffness and damping about the references; the
-rest (the difference of the two axes, the feedforward, the limiter's reduction) goes in as torque,
-computed for each sample. So at every sample the drive gives exactly the torque of the service;
-between samples, and when the service has died, its own law
+Each motor's own loop holds a module's mean stiffness and damping about the references. The rest
+(difference of the two axes, feedforward, the limiter's reduction) is sent as torque, computed for
+each sample. So at every sample the drive gives exactly the torque of the service. Between samples,
+and after the service has died, its own law
 
     torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel)
 
@@ -29,48 +29,48 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 
 GAIN_CHANGE: Final = 0.02
-"""Relative change of the gains below which the drive keeps its old ones: the difference goes in as
-torque, and the bus is spared."""
+"""Relative change of the gains below which the drive keeps its old ones: the difference is sent as
+torque, which saves traffic on the bus."""
 GAIN_UPDATE_MIN_MS: Final = 8
-"""Time between two changes of the drive's gains, ms. In a blend they would change in every cycle,
-and three modules on one CAN bus were 15 to 20 ms behind by its end; the difference goes in as
-torque."""
+"""Minimum time between two changes of the drive's gains, ms; the difference is sent as torque. In a
+blend the gains would change in every cycle, and three modules on one CAN bus were 15 to 20 ms
+behind by its end."""
 POS_GAIN_MAX: Final = 400.0
-"""1/s; least damping per stiffness, given to a stiffness with hardly any damping."""
+"""Maximum position gain, 1/s: a stiffness with hardly any damping gets more damping."""
 INPUT_TORQUE_SHARE: Final = 0.75
-"""Fraction of current_lim's torque that may go in as input_torque: the firmware clamps that by
-itself. A hip held with (900, 26) N m/rad has 463 on both motors, and from 0.25 rad off its
-reference the rest is more than the clamp lets through: its theta was 463 stiff instead of 26."""
+"""Fraction of current_lim's torque that may be sent as input_torque, which the firmware clamps on
+its own. A hip held with (900, 26) N m/rad has 463 on both motors. From 0.25 rad off its reference,
+the rest exceeds the clamp: its theta was 463 stiff instead of 26."""
 
 HOLD_SHARE: Final = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
-"""Fraction of the way from a drive's gains to HOLD's while its service leads.
+"""Share of the way from a module's gains to HOLD's that its drive's own gains take, by kind.
 
-An ankle's gains rise to all of HOLD's. On TRACK's own, with at most 4 N m s/rad on its phi, a push
-from the side decayed by 0.72 each half swing with all six services dead, and 7 of 26 pairs of
-pushes in step with it fell. A knee's gains rise to a fifth of HOLD's. Without that, a knee whose
-service froze was soft while the other leg's was stiff, and the robot fell (450 mm); with 600 N
-m/rad it moves by 23 mm. With all of HOLD's gains the hand feels the drive's gains, which the
-service subtracts 2 ms late: 26 N in the squat instead of 18; with 600 N m/rad 19.8. A module whose
-phi alone is stiff keeps its gains: half of them is on its theta.
+An ankle's gains rise to all of HOLD's. On TRACK's own gains, with at most 4 N m s/rad on its phi
+and all six services dead, a push from the side decayed by 0.72 each half swing, and 7 of 26 pairs
+of pushes in step with it made the robot fall. A knee's gains rise a fifth of the way. Without that,
+a knee whose service froze was soft while the other leg's was stiff, and the robot fell (450 mm);
+with 600 N m/rad it moves by 23 mm. With all of HOLD's gains, the hand feels the drive's gains,
+which the service subtracts 2 ms late: 26 N in the squat instead of 18, and 19.8 N with 600 N m/rad.
+A module that HOLD stiffens only in phi keeps its gains, because half of a rise would act on theta.
 """
 
 
 class DriveGains(msgspec.Struct):
-    """Gains that the drive has."""
+    """The drive's present gains."""
 
     stiffness: float = 0.0
-    """N m a turn"""
+    """N m/turn"""
     damping: float = 0.0
-    """N m s a turn"""
+    """N m s/turn"""
     changed_ns: int = 0
-    """Monotonic time of their last change; 0: none yet."""
+    """Monotonic time of their last change, ns; 0 before the first."""
 
 
 class DriveSetpointLaw:
-    """Makes the drive's targets."""
+    """Computes the drive's targets."""
 
     def __init__(self, gear_ratio: float, vel_limit: float, torque_max: float = math.inf) -> None:
-        """Take the gear ratio N, the drive's velocity limit, turn/s, and its torque limit, N m."""
+        """Set the gear ratio N, the drive's velocity limit, turn/s, and its torque limit, N m."""
         self._input_max = INPUT_TORQUE_SHARE * torque_max
         self._gear_ratio = gear_ratio
         self._per_turn = 2.0 * math.pi / (4.0 * gear_ratio * gear_ratio)
@@ -82,7 +82,7 @@ class DriveSetpointLaw:
         """Return the target under which the motors give the joint torques tau at this sample.
 
         Args:
-            gains: of the drive; they change rarely.
+            gains: the drive's gains, updated in place.
             now_ns: this module's monotonic clock.
             setpoint: the local law of this instant.
             tau: joint torques (phi, theta) for this sample, N m, after the limiter.
@@ -104,7 +104,7 @@ class DriveSetpointLaw:
         torque = (wanted[0] - vel_gain * (a - vel[0]), wanted[1] - vel_gain * (b - vel[1]))
         most = self._input_max
         if (abs(torque[0]) > most or abs(torque[1]) > most) and pos_gain > 0.0:
-            # what the firmware would clamp goes in by way of the position
+            # torque beyond the firmware's clamp is sent through the position
             a += (torque[0] - clamp(torque[0], -most, most)) / vel_gain
             b += (torque[1] - clamp(torque[1], -most, most)) / vel_gain
             a, b = clamp(a, -limit, limit), clamp(b, -limit, limit)
@@ -116,10 +116,10 @@ class DriveSetpointLaw:
         return MotorTarget(pos_ref, vel_ref, torque, (pos_gain, pos_gain), (vel_gain, vel_gain))
 
     def carried(self, target: MotorTarget, pos: Pair, vel: Pair) -> Pair:
-        """Return the joint torques, N m, that a drive left with this target gives at a sample.
+        """Return the joint torques, N m, of a drive at a sample after its last target.
 
         Args:
-            target: the last that was sent.
+            target: the last target that was sent.
             pos: motor positions of the sample, turns.
             vel: motor velocities of the sample, turn/s.
         """
@@ -134,7 +134,7 @@ class DriveSetpointLaw:
 
 
 def _follow(gains: DriveGains, now_ns: int, stiffness: float, damping: float) -> None:
-    """Adopt gains that have changed by more than `GAIN_CHANGE`; N m and N m s a turn."""
+    """Adopt gains that have changed by more than `GAIN_CHANGE`; N m/turn and N m s/turn."""
     damping = max(damping, stiffness / POS_GAIN_MAX)
     if abs(stiffness - gains.stiffness) > GAIN_CHANGE * gains.stiffness:
         gains.stiffness, gains.changed_ns = stiffness, now_ns
@@ -146,12 +146,12 @@ class DriveFallback:
     """Law with which a drive continues when its joint service dies."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Take HOLD's gains."""
+        """Read HOLD's gains."""
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
         self._share = HOLD_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
 
     def law(self, setpoint: Setpoint, mode: Mode) -> Setpoint:
-        """Return the fallback for a setpoint. In DAMP a drive without commands goes on sinking."""
+        """Return the fallback for a setpoint; in DAMP, a drive without commands keeps sinking."""
         if self._share == 0.0 or mode is Mode.DAMP:
             return setpoint
         return pd_law.raise_gains(setpoint, self._hold_k_p, self._hold_k_d, self._share)

@@ -2,23 +2,23 @@
 
 A planner may be wrong in any way: zero gains, a sign, a unit, a bit. Each module compares a command
 with the law's bounds over all poses (`GainSchedule.bounds`, made by `xrl gains`), with the joint's
-position, and with the command before. A command outside is refused, counted and reported
-(`JointState.outside`). If a planner goes on like that its last good command becomes too old, and
-the module holds.
+position, and with the previous command. A command outside is refused, counted and reported
+(`JointState.outside`). If a planner keeps sending such commands, its last good command becomes
+stale, and the module holds.
 
-The coupled torque answers to what the body's pose lacks, so in each module it pulls the way the
-local spring pulls. One that drives the joint away from its reference is wrong however small it is:
-ramped up together inside their bounds, those of knees and hips made the robot fall. Nor does it do
-much work on a joint that moves: 2 J under a push, and 6 J when a hand leads up by 0.45 m in a
-second, because the eased part of a lead comes with it. One that does more takes the robot along:
-ramped up in 0.3 s, knees and hips threw it off the floor.
+The coupled torque corrects the pose of the whole body, so in each module it pulls the same way as
+the local spring. A coupled torque that drives the joint away from its reference is wrong, however
+small: ramped up together inside their bounds, those of knees and hips made the robot fall. It also
+does little work on a moving joint: 2 J under a push, and 6 J when a hand leads up by 0.45 m in a
+second, because it includes the eased lead. More work moves the robot along: ramped up in 0.3 s,
+knees and hips threw it off the floor.
 
-A reference comes with its rate, so an ankle's goes the way its rate says: to 0.3 mrad while a
-person leads, 20 mrad while the height follows a reference of its own. One that goes another way by
-more than `q_ref_astray` / `ASTRAY_S` is wrong: drifting by 0.3 rad/s it took the robot over.
+A reference comes with its rate, so an ankle's reference moves as its rate says: to 0.3 mrad while a
+person leads, to 20 mrad while the height follows its own reference. A reference that deviates by
+more than `q_ref_astray` / `ASTRAY_S` is wrong: drifting by 0.3 rad/s, it tipped the robot over.
 
-A command with `hold` is obeyed anyway, but a module that refused its numbers is not ready to track
-(`Failsafe.ready`), so no planner leads with such numbers.
+A command with `hold` is accepted anyway. But a module that refused its numbers is not ready to
+track (`Failsafe.ready`), so no planner leads with such numbers.
 """
 
 from __future__ import annotations
@@ -37,39 +37,39 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 
 ROUNDING = 0.02
-"""Share of a gain that is allowed beyond: the schedule interpolates between rounded nodes."""
+"""Relative tolerance of the gain bounds: the schedule interpolates between rounded nodes."""
 GAP_TICKS = 4
-"""The step that is allowed grows with the time between commands no longer than so: a wrong torque
-that is refused again and again would be within it in the end."""
+"""Ticks for which the allowed torque step grows with the time between commands. Without this limit,
+a wrong torque that is refused repeatedly would be accepted in the end."""
 UNSETTLED: Final = 0.5
-"""Share of a spring's torque that counts in HOLD, and until TRACK has blended in: a robot that was
-held off centre still moves to the reference."""
+"""Share of a spring's torque that counts in HOLD, and until TRACK has blended in: a robot held off
+centre is still moving to the reference."""
 ASTRAY_S: Final = 0.5
-"""s; a way that the rate does not explain is forgotten with this time constant."""
+"""Time constant with which motion that the rate does not explain is forgotten, s."""
 ENERGY_S: Final = 0.3
-"""s; work of the coupled torque is forgotten with this time constant."""
+"""Time constant with which work of the coupled torque is forgotten, s."""
 _INSIDE: Final = Outside.NOTHING  # returned in each cycle: docs/contributing.md
 
 
 class Lately(msgspec.Struct, gc=False, frozen=True):
-    """What the tracked commands have done that none of them shows alone."""
+    """Cumulative effect of the tracked commands, which no single command shows."""
 
     astray: Pair = pd_law.ZERO
-    """How far the reference has gone another way than its rate says, rad."""
+    """Motion of the reference that its rate does not explain, rad."""
     energy: float = 0.0
-    """Work of the coupled torque, J; what it took counts as none."""
+    """Work of the coupled torque, J; never below 0."""
     at_ns: int = 0
-    """When the newest came, on this module's clock; 0 before the first."""
+    """Arrival of the newest command on this module's clock, ns; 0 before the first."""
 
 
 NOTHING_YET: Final = Lately()
 
 
 class Envelope:
-    """The bounds of one module."""
+    """Bounds on the commands of one module."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Take the bounds; without a schedule that has them every command is inside."""
+        """Read the bounds; without a schedule that has bounds, every command is inside."""
         schedule = config.gain_schedule
         table = schedule.bounds if config.law.split == "certified" and schedule else None
         self._bounds = bounds = table[kind_of(module)] if table else None
@@ -109,7 +109,7 @@ class Envelope:
             v: joint rates, rad/s.
             age_s: time by which the reference is extrapolated, s.
             settled: True if TRACK has blended in.
-            lately: `lately` of this command.
+            lately: result of `lately` for this command.
         """
         bounds, c = self._bounds, command
         if bounds is None:
@@ -151,15 +151,15 @@ class Envelope:
             return Outside.TORQUE_STEP
         return _INSIDE
 
-    def lately(
+    def accumulated(
         self, command: JointCommand, last: JointCommand | None, before: Lately, v: Pair, now_ns: int
     ) -> Lately:
-        """Return what this command adds to what the tracked ones have done.
+        """Return the cumulative effect of the tracked commands and this one.
 
         Args:
             command: the received command.
             last: the command that the module tracks; None if it does not track.
-            before: the same of the last command.
+            before: the cumulative effect up to the last command.
             v: joint rates, rad/s.
             now_ns: this module's clock.
         """
@@ -175,14 +175,14 @@ class Envelope:
 
     @staticmethod
     def _tau_ff_at(bounds: ModuleBounds, theta: float) -> Bounds:
-        """Return the bounds of tau_ff where the joint is."""
+        """Return the bounds of tau_ff at a joint angle theta, rad."""
         (low, high), rows = bounds.theta, bounds.tau_ff
         part = int(len(rows) * (theta - low) / max(high - low, 1e-9))
         return rows[min(len(rows) - 1, max(0, part))]
 
 
 def _astray(command: JointCommand, last: JointCommand, before: Pair) -> Pair:
-    """Return how far a reference has gone another way than its rate says, rad."""
+    """Return the motion of a reference that its rate does not explain, rad."""
     dt = 1e-9 * (command.t_ns - last.t_ns)
     kept = max(0.0, 1.0 - dt / ASTRAY_S)
     (phi, theta), (last_phi, last_theta) = command.q_ref, last.q_ref
@@ -194,7 +194,7 @@ def _astray(command: JointCommand, last: JointCommand, before: Pair) -> Pair:
 
 
 def _widened(gains: Bounds) -> Bounds:
-    """Return bounds of gains with the rounding that is allowed."""
+    """Return bounds of gains, widened by `ROUNDING`."""
     (phi_low, theta_low), (phi_high, theta_high) = gains
     return (
         ((1.0 - ROUNDING) * phi_low, (1.0 - ROUNDING) * theta_low),

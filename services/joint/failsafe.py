@@ -22,7 +22,7 @@ from shared.robot.hold_rules import Dropouts
 
 
 class Event(IntEnum):
-    """Events of a cycle, the gravest first; each cycle acts on one."""
+    """Events of a cycle, the most severe first; each cycle acts on one."""
 
     ESTOP = 0
     DRIVE_LOST = 1
@@ -41,11 +41,11 @@ class Event(IntEnum):
 
 
 Q_REF_MAX: Final = 6.4
-"""Largest reference that is believed, rad: a little over a turn, no joint goes so far."""
+"""Largest accepted reference, rad: a little over one turn, farther than any joint moves."""
 TAU_RATE_MAX: Final = 1e3
-"""Largest rate of the feedforward torque, N m/s for each N m of `Timing.tau_max`."""
+"""Largest accepted rate of the feedforward torque, N m/s per N m of `Timing.tau_max`."""
 TRIPS: Final = (Event.SHAKING, Event.TORQUE_LIMIT, Event.TOO_FAST)
-"""Trips that a module detects by itself while it tracks (`services.joint.trips`)."""
+"""Trips that a module detects on its own while it tracks (`services.joint.trips`)."""
 
 
 TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
@@ -84,7 +84,7 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
 }
 """(mode, event) -> (next mode, cause); an event that is not listed changes nothing. Only a new
 service leaves DAMP and FAULT, and only if a person requested it (`services.joint.rearm_guard`): a
-robot under load never stiffens again by itself."""
+robot under load never stiffens again on its own."""
 
 
 class Timing(msgspec.Struct, frozen=True):
@@ -95,7 +95,7 @@ class Timing(msgspec.Struct, frozen=True):
     engage_after_max_ns: int
     dropout_forget_ns: int
     dropouts_max: int
-    """Drop-outs that double the wait up to its maximum; more would only take longer to forget."""
+    """Dropouts that double the wait up to its maximum; more would only take longer to forget."""
     k_p_max: float
     k_d_max: float
     v_max: float
@@ -119,18 +119,18 @@ def timing_of(config: RobotConfig) -> Timing:
 
 
 FALLEN_NS: Final = 50 * NS_PER_MS
-"""How long a planner must report a fall before a module acts: one wrong command is not enough."""
+"""Time for which a planner must report a fall, ns: one wrong command is not enough."""
 RETIRED_SESSIONS_KEPT: Final = 256
-"""Planners that a module remembers; after more restarts the first of them could come back."""
+"""Number of earlier sessions that stay refused; after more restarts, the oldest could return."""
 TAU_ACCEPTED_MAX: Final = 4.0
-"""Largest feedforward and coupled torque that is believed, as a multiple of what a module's motors
-give: far from its reference the law may want more than they do, and the limiter cuts it."""
+"""Largest accepted feedforward and coupled torque, as a multiple of what a module's motors give:
+far from its reference the law may want more, and the limiter cuts it."""
 SEQ_AHEAD_MAX: Final = 500
-"""Largest step of a command's number: a wrong one, accepted, has all right ones refused."""
+"""Largest step of `seq`: a wrong number, once accepted, would have all correct ones refused."""
 TICKS_PER_S_MAX: Final = 2000
-"""More than any planner counts in a second, also while nobody hears it."""
+"""Upper bound on a planner's ticks in a second, including those whose commands are lost."""
 REFUSED_SHOWN_NS: Final = NS_PER_S
-"""How long the cause of the newest refusal is reported."""
+"""Time for which the cause of the newest refusal is reported, ns."""
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _HOLD, _TRACK = Mode.DISARMED, Mode.HOLD, Mode.TRACK
@@ -141,7 +141,7 @@ _INSIDE, _USABLE = Outside.NOTHING, Refusal.NONE
 
 
 class Failsafe(msgspec.Struct):
-    """The state of one joint service's failsafe."""
+    """State of one joint service's failsafe."""
 
     mode: Mode = Mode.DISARMED
     command: JointCommand | None = None
@@ -151,9 +151,9 @@ class Failsafe(msgspec.Struct):
     retired: tuple[int, ...] = ()
     """Earlier sessions, the last `RETIRED_SESSIONS_KEPT`; their commands are refused."""
     fresh_since_ns: int = -1
-    """Start of the unbroken time with usable commands; -1 if there is none."""
+    """Start of the unbroken time with usable commands, ns; -1 without any."""
     dropouts: Dropouts = msgspec.field(default_factory=Dropouts)
-    """Recent drop-outs of commands; each doubles the wait before TRACK."""
+    """Recent dropouts of commands; each doubles the wait before TRACK."""
     refused: int = 0
     refusal: Refusal = Refusal.NONE
     """Cause of the newest refusal."""
@@ -168,7 +168,7 @@ class Failsafe(msgspec.Struct):
     planner_ended: bool = False
     """True from the end of the followed planner's process until the cycle that acts on it."""
     fallen_since_ns: int = -1
-    """Time since which the planner has said that the robot has fallen; -1: it does not."""
+    """Time since which the planner has reported a fall, ns; -1 if it does not."""
     limp: bool = False
     """In DAMP: the robot has fallen, and this module only damps."""
 
@@ -210,7 +210,7 @@ class Failsafe(msgspec.Struct):
             self.planner_ended = True
 
     def count_malformed(self, count: int, now_ns: int) -> None:
-        """Count what came as a command and was none."""
+        """Count received commands that could not be decoded."""
         self._count(Refusal.MALFORMED, 0, count, now_ns)
 
     def _count(self, refusal: Refusal, session: int, count: int, now_ns: int) -> None:
@@ -245,11 +245,11 @@ class Failsafe(msgspec.Struct):
         )
 
     def engage_after_ns(self, timing: Timing) -> int:
-        """Return the time of fresh commands before TRACK, ns; each drop-out doubles it."""
+        """Return how long commands must be fresh before TRACK, ns; each dropout doubles it."""
         return min(timing.engage_after_ns << self.dropouts.count, timing.engage_after_max_ns)
 
     def ready(self, now_ns: int, timing: Timing) -> bool:
-        """Return True if this module can track and accepted commands for long enough."""
+        """Return True if this module can track and has accepted commands for long enough."""
         return (
             (self.mode is _TRACK or self.mode is _HOLD)
             and self.outside is _INSIDE
@@ -271,7 +271,7 @@ class Failsafe(msgspec.Struct):
             now_ns: this module's clock.
             timing: times and limits.
             drive: DRIVE_LOST, DRIVE_DISARMED, POSITION_LOST, DRIVE_ARMED or NONE.
-            estop: the emergency stop is engaged.
+            estop: True if the emergency stop is engaged.
             trip: one of `TRIPS`, or NONE.
         """
         mode, fresh = self.mode, self.is_fresh(now_ns, timing)
@@ -292,7 +292,7 @@ class Failsafe(msgspec.Struct):
             gone = estop or not (drive is _NONE or drive is _DRIVE_ARMED)
             if not gone and event is not _FALLEN:
                 event = trip
-                self.fresh_since_ns = now_ns  # after a trip it waits as after a drop-out
+                self.fresh_since_ns = now_ns  # after a trip it waits as after a dropout
         row = TRANSITIONS[mode].get(event)
         self.dropouts.advance(
             now_ns,
@@ -328,7 +328,7 @@ class Failsafe(msgspec.Struct):
         age = now_ns - command.echo_t_ns
         if age < 0:
             return Refusal.FROM_THE_FUTURE
-        # another session takes over only when no usable command of the present one is left
+        # another session takes over only once no command of the present one is usable
         foreign = command.session != self.session
         if foreign and (command.session in self.retired or self.is_fresh(now_ns, timing)):
             return Refusal.FOREIGN_SESSION

@@ -1,14 +1,14 @@
-"""Estimates how warm a module's motors and output stages are, and how long the load can last. Pure.
+"""Estimates the temperatures of motors and output stages, and the time left at their load. Pure.
 
-Two nodes for each motor, one for each output stage, with the figures of [heat] in the robot file;
-Iq is a motor's current, by its torque:
+Each motor has two nodes and each output stage one, with the figures of [heat] in the robot file; Iq
+is a motor's current, from its torque:
 
     C_w T_w' = 1.5 R Iq^2 - (T_w - T_h) / R_wh        R = R_25 (1 + alpha (T_w - 25 C))
     C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha
     t_s T_s' = T_a + k_s Iq^2 - T_s
 
-What the drive reports corrects the estimate. The seconds left are those until a winding or an
-output stage is at its limit, if the mean load of the last `LOAD_S` goes on.
+The drive's readings correct the estimate. The seconds left are the time until a winding or an
+output stage reaches its limit, if the mean load of the last `LOAD_S` continues.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from shared.run_directory import live_dir, mapped
 STEP_S: Final = 0.5
 """Step of the estimate, and of the seconds left."""
 GAP_S: Final = 5.0
-"""Longest time for which the last load is taken to have gone on: a stopped process."""
+"""Maximum time for which the last load is assumed to continue in a stopped process, s."""
 LOAD_S: Final = 4.0
 """Time constant of the mean load: a squat takes 5 s."""
 UNKNOWN_S: Final = -1.0
-"""Seconds left where nothing is estimated."""
+"""Value of the seconds left without an estimate."""
 FOLLOW: Final = 0.5
-"""Share of a thermistor's surprise that is believed, once a second, of winding and housing alike. A
-housing that is off pulls its winding off by 2 % of that in a second: it is found in a minute."""
+"""Share of a thermistor's deviation that corrects winding and housing alike, once a second. A
+housing error shifts its winding by 2 % of that in a second, so it is corrected within a minute."""
 HOLDS_S: Final = 60.0
-"""Time for which a drive is taken to have held on after its service ended; one is back in 5 s."""
+"""Time for which a drive is assumed to hold after its service ended, s; a new one starts in 5 s."""
 COOLS_S: Final = 4.0 * 3600.0
-"""A module is cold after so long."""
+"""Time after which a module is cold, s."""
 COPPER: Final = 0.00393
-"""1/K, resistance of copper at 25 C."""
+"""Temperature coefficient of copper's resistance at 25 C, 1/K."""
 REFERENCE: Final = 25.0
-"""C at which the resistance is given."""
+"""Temperature at which the resistance is given, C."""
 _GRID_S: Final = tuple(LEFT_MAX_S * 1.35 ** (k - 29) for k in range(30))
-"""Times at which a winding is looked at, s: from 0.6 s on."""
+"""Times at which a winding's temperature is predicted, s: from 0.6 s on."""
 
 
 class HeatState(msgspec.Struct):
@@ -57,45 +57,45 @@ class HeatState(msgspec.Struct):
     square: Pair = (0.0, 0.0)
     """Sum of the squared motor torques since the last step, (N m)^2."""
     cycles: int = 0
-    """Cycles in it."""
+    """Cycles in that sum."""
     load: Pair = (0.0, 0.0)
     """Mean squared motor torques, (N m)^2."""
     stepped_ns: int = 0
-    """Time of the last step; 0: none yet."""
+    """Time of the last step, ns; 0 before the first."""
     left_s: float = UNKNOWN_S
-    """To a tenth."""
+    """Seconds left at the mean load, to a tenth."""
     shown: Pair = (0.0, 0.0)
-    """Windings to a tenth, for the messages."""
+    """Winding temperatures for the messages, to a tenth."""
 
     @property
     def kept(self) -> tuple[float, ...]:
-        """Numbers that a service that starts after this one needs, C and (N m)^2."""
+        """Values that the next service starts from, C and (N m)^2."""
         return (*self.winding, *self.housing, *self.stage, *self.load)
 
 
 class _Motor(NamedTuple):
-    """The two nodes as a linear system, but for the load."""
+    """The two nodes as a linear system, without the load."""
 
     ambient: float
     exchange: float
-    """From winding to housing over the winding's capacity, 1/s."""
+    """Conductance from winding to housing over the winding's capacity, 1/s."""
     gain: float
-    """The same over the housing's capacity, 1/s."""
+    """The same conductance over the housing's capacity, 1/s."""
     loss: float
-    """The housing's to the air, 1/s."""
+    """Conductance from housing to air over the housing's capacity, 1/s."""
     heating: float
-    """C/s of the winding at 25 C per (N m)^2."""
+    """Heating of the winding at 25 C, C/s per (N m)^2."""
 
 
 class HeatEstimate:
     """Temperatures of one module.
 
     Attributes:
-        enabled: [heat] of the robot file says what the motors are.
+        enabled: True if [heat] of the robot file describes the motors.
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Take the figures; motors and output stages begin as warm as the air."""
+        """Read the figures of [heat]."""
         heat = config.heat
         self.enabled = heat.estimate
         per_torque2 = 1.0 / config.drive.torque_constant**2
@@ -111,7 +111,7 @@ class HeatEstimate:
         self._winding_max, self._stage_max = heat.winding_max, heat.stage_max
 
     def cold(self) -> HeatState:
-        """Return the state of a module that is as warm as the air."""
+        """Return the state of a module at the temperature of the air."""
         if not self.enabled:
             return HeatState()
         start: Pair = (self._motor.ambient, self._motor.ambient)
@@ -123,11 +123,11 @@ class HeatEstimate:
         """Update the estimate with one cycle.
 
         Args:
-            s: the estimate, which changes.
+            s: the estimate, updated in place.
             now_ns: this module's clock.
-            motor_torque: of the two motors, N m.
-            fet: what the drive reports of its output stages, C; None: nothing new.
-            motor: what its motors' thermistors report, C; None: nothing new, or there are none.
+            motor_torque: torques of the two motors, N m.
+            fet: readings of the output stages, C; None without new ones.
+            motor: readings of the motors' thermistors, C; None without new ones.
         """
         a, b = motor_torque
         s.square = (s.square[0] + a * a, s.square[1] + b * b)
@@ -149,12 +149,12 @@ class HeatEstimate:
             self._show(s)
 
     def resume(self, s: HeatState, kept: tuple[float, ...], passed_s: float) -> None:
-        """Start as warm as an earlier service left the module, cooled since.
+        """Start from the temperatures that an earlier service left, cooled since.
 
-        A drive may have held the robot meanwhile, by its own loop: the load goes on for `HOLDS_S`.
+        The drive may have held the robot meanwhile, so the load continues for `HOLDS_S`.
 
         Args:
-            s: the estimate, which changes.
+            s: the estimate, updated in place.
             kept: `HeatState.kept` of the earlier service.
             passed_s: time since then, s.
         """
@@ -167,7 +167,7 @@ class HeatEstimate:
         s.load = (g, h)
 
     def skip(self, s: HeatState, seconds: float) -> None:
-        """Let time pass for the temperatures alone, under the present mean load (lockstep)."""
+        """Advance only the temperatures, under the present mean load; also for lockstep."""
         while seconds > 0.0:
             self._step(s, s.load, min(STEP_S, seconds))
             seconds -= STEP_S
@@ -203,9 +203,9 @@ class HeatEstimate:
         return min(LEFT_MAX_S, left_s)
 
     def _winding_left_s(self, s: HeatState, i: int) -> float:
-        """Return when the winding crosses its limit, by the exact solution on a grid of times.
+        """Return the time until the winding reaches its limit, s: exact, on a grid of times.
 
-        With the resistance that rises the system stays linear:
+        The system stays linear although the resistance rises with the temperature:
 
             x' = A x + B, x = (T_w - T_a, T_h - T_a), A = [[h - e, e], [g, -g - l]]
         """
@@ -220,7 +220,7 @@ class HeatEstimate:
         determinant = a * d - e * g
         if abs(determinant) < 1e-15:
             return LEFT_MAX_S
-        # at rest A x = -B; (hot, warm) minus that decays along two eigenvectors (e, lambda - a)
+        # in equilibrium A x = -B; the rest of (hot, warm) decays along eigenvectors (e, lambda - a)
         hot_end, warm_end = -d * B / determinant, g * B / determinant
         root = math.sqrt((a - d) ** 2 + 4.0 * e * g)
         fast, slow = 0.5 * (a + d - root), 0.5 * (a + d + root)
@@ -237,7 +237,7 @@ class HeatEstimate:
 
 
 def report(s: HeatState, fet: Pair | None, motor: Pair | None) -> None:
-    """Correct an estimate by what the drive reports, C; None: nothing new."""
+    """Correct an estimate with the drive's readings, C; None without new ones."""
     if fet is not None:
         s.stage = fet
     if motor is not None:
@@ -248,28 +248,28 @@ def report(s: HeatState, fet: Pair | None, motor: Pair | None) -> None:
 
 _KEPT: Final = struct.Struct("<q8d")
 _POSSIBLE: Final = (-60.0, 400.0)
-"""C; a file with anything else is none."""
+"""Range of valid values; a file with any other is ignored."""
 
 
 class HeatFile:
-    """A module's temperatures in its live directory: a service that restarts finds it warm.
+    """A module's temperatures in its live directory, for a service that restarts.
 
-    The file is mapped: writing it is a store, which the control path may do. The supervisor
-    copies it to the disk (`tools.fleet.kept_state`). Times are of the monotonic clock; after a
-    restart of the host nothing counts as cooled.
+    The file is mapped: writing it is a store, which the control path may do. The supervisor copies
+    it to the disk (`tools.fleet.kept_state`). Times are on the monotonic clock, so after a restart
+    of the host no cooling is assumed.
     """
 
     def __init__(self, run_dir: Path, module: str) -> None:
-        """Open it, or make it; the directory is there.
+        """Open the file, or create it; the directory must exist.
 
         Raises:
-            FleetError: it cannot be made.
+            FleetError: the file cannot be created.
         """
         self._memory = mapped(live_dir(run_dir) / f"{module}.heat", _KEPT.size)
         self._written_ns = 0
 
     def restore(self, estimate: HeatEstimate, s: HeatState, now_ns: int) -> None:
-        """Make an estimate's state go on from what the file holds, if it holds anything."""
+        """Continue an estimate from the file's values, if they are valid."""
         then_ns, *kept = _KEPT.unpack(self._memory[:])
         low, high = _POSSIBLE
         possible = all(low < one < high for one in kept) and min(kept[6:]) >= 0.0
@@ -277,7 +277,7 @@ class HeatFile:
             estimate.resume(s, tuple(kept), max(0, now_ns - then_ns) / NS_PER_S)
 
     def write(self, s: HeatState) -> None:
-        """Write the state if the estimate has made a step since."""
+        """Write the state if the estimate has made a step since the last write."""
         if s.stepped_ns != self._written_ns:
             self._written_ns = s.stepped_ns
             self._memory[:] = _KEPT.pack(s.stepped_ns, *s.kept)

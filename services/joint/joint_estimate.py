@@ -1,14 +1,14 @@
 """The joint's position and speed from a drive's samples, and which samples are accepted. Pure.
 
-A drive without a valid position goes on reporting numbers. Firmware 0.5.6 repeats the last value of
-a lost encoder until a heartbeat shows the error, and starts over, turns away, when it is back; a
-restarted drive reports 0. Accepted for 40 ms, a knee at 0 was commanded -107 N m. So a sample that
-the joint cannot have reached is rejected, and after a few of them the position counts as lost. So
-it does when whole turns may be missing (`turn_watch`), also while the module is not controlled.
+A drive without a valid position keeps reporting numbers. Firmware 0.5.6 repeats the last value of a
+lost encoder until a heartbeat shows the error, and restarts its count, whole turns off, when it is
+back. A restarted drive reports 0: accepted for 40 ms, a knee at 0 was commanded -107 N m. So a
+sample that the joint cannot have reached is rejected. After a few of them, or when whole turns may
+be missing (`turn_watch`), the position counts as lost, even while the module is not controlled.
 
-A service that is held up reads two samples as one, or two within half a millisecond. By counting
-its cycles, it would from then on send its states a cycle apart from the other modules
-(`services.planner.state_phases`). So `SampleClock` counts the periods that have gone by.
+A service that is held up reads two samples as one, or two within half a millisecond. If it counted
+its cycles, it would then send its states one cycle apart from the other modules
+(`services.planner.state_phases`). So `SampleClock` counts elapsed periods.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 
 JUMP_TURNS: Final = 0.1
-"""Largest jump at the motor beyond the last velocity, turns: 0.02 rad at the joint."""
+"""Largest jump at the motor beyond the last velocity's, turns: 0.02 rad at the joint."""
 JUMP_SPEED: Final = 10.0
-"""turn/s that a motor may have gained since the last sample, which may be 100 ms old: a leg
-in free fall gains 8."""
+"""Speed that a motor may have gained since the last sample, turn/s. That sample may be 100 ms old,
+and a leg in free fall gains 8."""
 SPEED_MAX: Final = 300.0
-"""turn/s: 100 rad/s at a joint behind 18:1, as `services.planner.watch.plausible` has it. A speed
-of 1e30 would also excuse any jump after it."""
+"""Largest speed, turn/s: 100 rad/s at a joint behind 18:1, as in
+`services.planner.watch.plausible`. A speed of 1e30 would also excuse any later jump."""
 REJECTED_MAX: Final = 3
 """Number of rejected samples in a row after which the position is lost."""
 
@@ -75,11 +75,11 @@ class JointEstimate(msgspec.Struct):
     first: TurnWatch = msgspec.field(default_factory=TurnWatch)
     second: TurnWatch = msgspec.field(default_factory=TurnWatch)
     supply_v: float = 0.0
-    """Voltage of the drive's supply, V; 0: not known."""
+    """Voltage of the drive's supply, V; 0 if unknown."""
 
     @property
     def turns_lost(self) -> bool:
-        """True if the drive's count may lack turns, until it has no zero any more."""
+        """True if the drive's count may lack turns, until its zero is cleared."""
         return self.first.lost or self.second.lost
 
     @property
@@ -88,20 +88,28 @@ class JointEstimate(msgspec.Struct):
         known = self.first.encoder_zero != UNKNOWN and self.second.encoder_zero != UNKNOWN
         return known and (self.first.moved or self.second.moved)
 
-    def take(self, reading: DriveReading, *, armed: bool, flushing: bool = False) -> Event:
-        """Take a sample; return its event for the failsafe.
+    def process(
+        self,
+        reading: DriveReading,
+        *,
+        armed: bool,
+        flushing: bool = False,
+        tau: Pair = (0.0, 0.0),
+    ) -> Event:
+        """Process a sample; return its event for the failsafe.
 
         Args:
             reading: the drive's sample.
             armed: True if the module is controlled; otherwise any position is accepted.
-            flushing: samples may be old, and jump: nothing is judged.
+            flushing: True if samples may be old and jump; no jump is rejected then.
+            tau: last torque of both joints, N m.
         """
         self.status, self.error, self.t_ns = reading.status, reading.error, reading.t_ns
         self.supply_v = reading.supply_v
         event = _EVENT[reading.status]
         if event is _DRIVE_LOST:
-            return event  # with positions that are old
-        if event is _POSITION_LOST:  # they mean nothing, and the next zero is a new one
+            return event  # its positions are old
+        if event is _POSITION_LOST:  # positions mean nothing until a new zero
             self.first, self.second = TurnWatch(lost=armed), TurnWatch(lost=armed)
             self.accepted_ns = 0
             return event
@@ -109,9 +117,9 @@ class JointEstimate(msgspec.Struct):
         if reading.encoder_zero is not None:
             first.compare(reading.encoder_zero[0])
             second.compare(reading.encoder_zero[1])
-        if reading.error & _ENCODER_FAILED:  # when it is back, turns may be missing
+        if reading.error & _ENCODER_FAILED:  # once it is back, turns may be missing
             first.lost = second.lost = True
-        possible = flushing or not self.accepted_ns or self._is_plausible(reading, armed=armed)
+        possible = flushing or not self.accepted_ns or self._is_plausible(reading, tau, armed=armed)
         if armed and not possible:
             self.rejected_count += 1
             if self.rejected_count >= REJECTED_MAX:
@@ -128,8 +136,8 @@ class JointEstimate(msgspec.Struct):
         self.v = joint_from_motor(reading.vel_turns, self.gear_ratio)
         return event
 
-    def _is_plausible(self, reading: DriveReading, *, armed: bool) -> bool:
-        """Return True if the motors can have come here since the last accepted sample."""
+    def _is_plausible(self, reading: DriveReading, tau: Pair, *, armed: bool) -> bool:
+        """Return True if the motors can have moved here since the last accepted sample."""
         (a, b), (speed_a, speed_b) = reading.pos_turns, reading.vel_turns
         if not (abs(speed_a) <= SPEED_MAX and abs(speed_b) <= SPEED_MAX):
             return False
@@ -138,23 +146,26 @@ class JointEstimate(msgspec.Struct):
         (was_a, was_b), (vel_a, vel_b) = self.pos, self.vel
         free = JUMP_TURNS + JUMP_SPEED * dt_s
         jump_a, jump_b = a - was_a, b - was_b
-        first_can = first.take(t_ns, a, speed_a, jump_a, free + abs(vel_a) * dt_s)
-        second_can = second.take(t_ns, b, speed_b, jump_b, free + abs(vel_b) * dt_s)
+        phi, theta = tau
+        on_first, on_second = (theta + phi, theta - phi) if armed else (None, None)
+        free_a, free_b = free + abs(vel_a) * dt_s, free + abs(vel_b) * dt_s
+        first_can = first.process(t_ns, a, speed_a, jump_a, free_a, on_first)
+        second_can = second.process(t_ns, b, speed_b, jump_b, free_b, on_second)
         first.moved = not armed and (first.moved or not first_can)
         second.moved = not armed and (second.moved or not second_can)
         return first_can and second_can
 
 
 FOLLOW_SHIFT = 3
-"""The clock follows a sample's time by an eighth: a single late sample counts as one."""
+"""The clock follows a sample's time by an eighth, so a single late sample still counts as one."""
 
 
 class SampleClock(msgspec.Struct):
     """Periods since the first sample.
 
     Attributes:
-        count: of periods; 0 before the first.
-        before: the count at the sample before.
+        count: number of periods; 0 before the first.
+        before: count at the previous sample.
     """
 
     count: int = 0
@@ -163,7 +174,7 @@ class SampleClock(msgspec.Struct):
     """When the present period began, smoothed."""
 
     def advance(self, now_ns: int, period_ns: int) -> None:
-        """Take the time of a cycle, and the drive's period."""
+        """Update the count with the time of a cycle and the drive's period."""
         self.before = self.count
         if not self.count:
             self.count, self.at_ns = 1, now_ns
@@ -175,8 +186,8 @@ class SampleClock(msgspec.Struct):
         self.at_ns += (now_ns - self.at_ns) >> FOLLOW_SHIFT
 
     def passed(self, every: int, phase: int) -> bool:
-        """Return True if a period phase, phase + every, ... began since the sample before.
+        """Return True if a period phase, phase + every, ... began since the previous sample.
 
-        With a sample lost, it is the next sample that passes it.
+        If a sample is lost, the next one passes the period.
         """
         return (self.count - phase) // every > (self.before - phase) // every

@@ -1,6 +1,6 @@
 """The joint service's loop, clocked by the drive's encoder frames.
 
-Live, lockstep and re-execution run this loop over ports, a drive and a clock of their own.
+Live operation, lockstep and re-execution run this loop, each with its own ports, drive and clock.
 """
 
 from __future__ import annotations
@@ -46,55 +46,55 @@ READ_TIMEOUT_S: Final = 0.005
 """Longest wait for a sample; a cycle without one still runs the age rule and the failsafe."""
 
 REPORT_EVERY_NS: Final = 10 * NS_PER_S
-"""Time between two reports of what keeps a drive from being armed, ns."""
+"""Period at which the reason why a drive is not armed is logged again, ns."""
 START_NS: Final = 2 * NS_PER_S
-"""Time after which a drive that does not acknowledge is an error: it may start late, ns."""
+"""Time for which a drive may fail to acknowledge before that is an error, ns: it may start late."""
 
 _WHY_NOT: Final = {
-    ArmingInhibit.UNZEROED: "the drive has had no power since it was zeroed, or never was, or its "
-    "encoder is lost; hang the robot and tell it where it is with `xrl drive zero`",
+    ArmingInhibit.UNZEROED: "the drive lost its power or its encoder since it was zeroed, or never "
+    "was zeroed; hang the robot from its hoist and run `xrl drive zero`",
     ArmingInhibit.OUTSIDE_LIMITS: "the joint is at phi {q[0]:.3f}, theta {q[1]:.3f} rad, outside "
-    "its limits; bring it inside, or correct the joint's zero",
+    "its limits; move it inside them, or correct the joint's zero",
     ArmingInhibit.LOST_TORQUE: "the drive held the robot and lost torque while no service ran: "
-    "drive error 0x{error:x}; hang the robot, find out why, then ask for it: xrl kill MODULE",
-    ArmingInhibit.WAITING: "the drive holds by its own loop; it is taken over once a planner is "
-    "there",
-    ArmingInhibit.FAILED: "drive error 0x{error:x}; it is cleared, and the drive armed if it stays "
-    "away",
-    ArmingInhibit.UNACKNOWLEDGED: "nobody acknowledges a frame on CAN bus {bus}: power of the "
-    "drive, its CAN cable, `xrl doctor`",
-    ArmingInhibit.REFUSED: f"requested {ARM_TRIES} times: drive error 0x{{error:x}}",
+    "drive error 0x{error:x}; hang the robot, find the cause, then run `xrl kill MODULE`",
+    ArmingInhibit.WAITING: "the drive holds with its own loop; the service takes it over once a "
+    "planner runs",
+    ArmingInhibit.FAILED: "drive error 0x{error:x}; the service clears it, and arms the drive if "
+    "it does not return",
+    ArmingInhibit.UNACKNOWLEDGED: "no node acknowledges a frame on CAN bus {bus}; check the "
+    "drive's power and its CAN cable, and run `xrl doctor`",
+    ArmingInhibit.REFUSED: f"{ARM_TRIES} requests to arm failed: drive error 0x{{error:x}}",
 }
 
 
 class _OtherModules(Protocol):
-    """What the joint services of a host know of each other, without a bus."""
+    """View that the joint services of a host have of each other, without a bus."""
 
     def view(self, now_ns: int, /) -> NeighbourView:
-        """Return what this module knows of the others."""
+        """Return this module's view of the others."""
 
     def write(self, row: NeighbourRow, /) -> None:
-        """Write down where this module is."""
+        """Write this module's row."""
 
 
 class _SessionEnds(Protocol):
-    """What is seen of the planner's process on this host."""
+    """Watch over the planner's process on this host."""
 
     def ended(self) -> int:
         """Return the session of a planner whose process has ended since the last call, else 0."""
 
 
 class JointPorts(msgspec.Struct, frozen=True):
-    """What one joint service takes and sends."""
+    """Inputs and outputs of one joint service."""
 
     commands: CountingInbox[JointCommand]
     estops: Inbox[Estop]
     states: Outbox[JointState]
     events: Outbox[JointEvent]
     traces: Outbox[JointTrace] | None
-    """None: nothing is recorded for re-execution."""
+    """None if nothing is recorded for re-execution."""
     planner: _SessionEnds | None = None
-    """None: its end is not seen, and its commands grow old."""
+    """None if its end cannot be seen; its commands then become stale."""
 
 
 class JointLoop:
@@ -111,17 +111,17 @@ class JointLoop:
         clock: Callable[[], int] | None = None,
         heat_file: HeatFile | None = None,
     ) -> None:
-        """Take the parts of the service.
+        """Connect the parts of the service.
 
         Args:
             config: the robot.
-            module: decisions of a cycle.
+            module: the decisions of a cycle.
             drive: the module's drive.
             ports: publishers and subscribers.
-            rearm_guard: shared memory for the next service of this module, and for a local stop.
-            neighbours: the six services on this host.
-            clock: in place of this host's monotonic one, ns.
-            heat_file: how warm an earlier service left the module, and for the next.
+            rearm_guard: shared memory for the next service of this module and for a local stop.
+            neighbours: this module's view of the other services on this host.
+            clock: replaces this host's monotonic clock, ns.
+            heat_file: temperatures from the previous service of this module, for the next.
         """
         self.module = module
         self._rearm_guard, self._neighbours = rearm_guard, neighbours
@@ -140,9 +140,9 @@ class JointLoop:
     def run(self, stop: StopFlag) -> None:
         """Run until a signal stops it.
 
-        On SIGTERM the service ends alone: a drive that holds by its own loop goes on holding, the
-        robot stands on it, and the next service takes it over. On SIGINT the fleet goes down: the
-        drive is left idle.
+        On SIGTERM only this service ends: a drive that holds with its own loop keeps holding the
+        robot, and the next service takes it over. On SIGINT the whole fleet stops, and the drive is
+        left idle.
         """
         while not stop:
             self.report(self.cycle())
@@ -156,7 +156,7 @@ class JointLoop:
             self._rearm_guard.write(LastState.NOTHING)
 
     def cycle(self) -> DriveAction:
-        """Run one cycle; return what was decided, and done."""
+        """Run one cycle; return the action that was decided and sent to the drive."""
         module, ports, tracer = self.module, self._ports, self._tracer
         reading = self._drive.read(READ_TIMEOUT_S)
         now = self._clock()
@@ -175,7 +175,7 @@ class JointLoop:
         step = module.step(now, reading, command, estop, near)
         controller, state = module.controller, module.state.controller
         due = controller.is_state_due(state)
-        if state.states == 0:  # a module that cannot say where it is must not arm
+        if state.states == 0:  # a module that cannot publish its state must not arm
             self._has_sent, due = ports.states.put(controller.state(state, now)), False
         self._write(step)
         if self._neighbours is not None:
@@ -195,7 +195,7 @@ class JointLoop:
         return step
 
     def _is_stopped(self, now: int) -> bool:
-        """Return True if an emergency stop has come or is set here, or the pendant is silent."""
+        """Return True if an emergency stop arrived or is set here, or the pendant is silent."""
         stop, guard = self._ports.estops.take(), self._rearm_guard
         if guard is None:
             return stop is not None
@@ -219,11 +219,11 @@ class JointLoop:
         elif order is DriveCommand.IDLE:
             drive.idle()
         elif order is DriveCommand.CLEAR_ZERO:
-            with suppress(DriveError):  # the drive is gone, and its zero with it
+            with suppress(DriveError):  # the drive is lost, and so is its zero
                 drive.set_position(self._nowhere)
 
     def report(self, step: DriveAction) -> None:
-        """Log what a person must know; the module is not controlled then, so a log line is safe."""
+        """Log faults and arming problems; the module does not track then, so logging is safe."""
         if step.event is None and step.inhibit is ArmingInhibit.NONE:
             return
         now, samples = self._clock(), self.module.state.controller.estimate
@@ -232,10 +232,10 @@ class JointLoop:
         if step.event is not None and step.event.mode_after == Mode.FAULT:
             dead_bus = samples.status is DriveStatus.UNACKNOWLEDGED
             log.get("xrl").error(
-                "FAULT: %s, drive error 0x%x%s; restart this service to leave it",
+                "FAULT: %s, drive error 0x%x%s; restart this service to leave FAULT",
                 Cause(step.event.cause).name,
                 samples.error,
-                f", nobody acknowledges on CAN bus {self.module.bus}" if dead_bus else "",
+                f", no node acknowledges a frame on CAN bus {self.module.bus}" if dead_bus else "",
             )
         reported = step.inhibit is self._reported and now < self._report_at_ns
         if step.inhibit is not ArmingInhibit.NONE and not reported:

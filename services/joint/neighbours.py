@@ -1,20 +1,20 @@
 """Shared memory between the six joint services of one host, without a bus.
 
-After an emergency stop the knees sink. Ankles that only hold let the COM go back as the knees fold:
-from nearly straight legs (1.28 m) the robot fell over backwards. An ankle that knows the angle of
-its knee keeps the hip joint where it was. Hips that only damp are dragged along by the thighs: the
-torso turned back by 1.5 rad, and with its COM 5 cm back and 10 cm up the robot fell over. A hip
-that knows the angles of its ankle and knee holds the torso's attitude. A knee that sinks beside a
-knee whose service is dead tips the robot sideways: it fell within 4 s. Beside an ankle or a hip
-whose drive goes on holding where it was, it fell in 28 of 40 stops. So each knee must know whether
-all the others go down with it. A limp module makes the others stiffen, in HOLD and in DAMP
-(`shared.robot.hold_rules`). Without that the robot fell within 1.3 s of a knee that went limp
-with the planner dead, and within 2 s of a stop beside a limp knee. A drive without power only falls
-silent: stiffened for once it was lost, after 100 ms, the robot fell in 3 of 4 squats.
+After an emergency stop the knees sink. With ankles that only held, the COM moved back as the knees
+folded: from nearly straight legs (1.28 m) the robot fell over backwards. An ankle that knows its
+knee's angle keeps the hip joint where it was. With hips that only damped, the thighs dragged the
+torso back by 1.5 rad; with its COM 5 cm back and 10 cm up, the robot fell over. A hip that knows
+its ankle's and knee's angles holds the torso's attitude. A knee that sinks beside a knee whose
+service is dead tips the robot sideways: it fell within 4 s. Beside an ankle or a hip whose drive
+kept holding, it fell in 28 of 40 stops. So each knee must know whether all others go down with it.
+A limp module makes the others stiffen, in HOLD and in DAMP (`shared.robot.hold_rules`). Otherwise
+the robot fell within 1.3 s of a knee that went limp with the planner dead, and within 2 s of a stop
+beside a limp knee. A drive that loses power only falls silent. When the others stiffened only once
+it was lost, after 100 ms, the robot fell in 3 of 4 squats.
 
-All this must work with planner and bus dead. So each service writes its row into a file that all
-six have mapped: a store to memory in each cycle, which the control path may do. Modules on another
-host are unknown: hips then damp, knees sink, and only a planner makes the others stiffen.
+This must work with planner and bus dead. So each service stores its row in each cycle in a file
+that all six have mapped, which the control path may do. Modules on another host are unknown: hips
+then damp, knees sink, and only a planner makes the others stiffen.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from shared.robot.hold_rules import SUPPORT_FOR
 from shared.run_directory import live_dir, mapped
 
 STALE_NS: Final = 20 * NS_PER_MS
-"""An older angle says nothing of where the joint is now."""
+"""Maximum age of a neighbour's angle, ns."""
 SILENT_NS: Final = 40 * NS_PER_MS
-"""Silence after which a drive may be limp, ns: before the age rule makes the others hold, and long
-before the drive counts as lost, which is for good."""
+"""Silence after which a drive may be limp, ns: shorter than the age limit, and much shorter than
+the time after which the drive counts as lost for good."""
 GONE_NS: Final = round(LOST_S * NS_PER_S)
 """Age of a row beyond which its service is dead or its drive is lost, ns."""
 _LEG: Final = N_MODULES // 2
-"""From a module to its like of the other leg."""
+"""Offset from a module to the same module of the other leg."""
 _SUM: Final = struct.Struct("<Q")
 _BODY: Final = struct.Struct("<QddQQQ")
 _ROW: Final = struct.Struct("<QQddQQQ")
-"""The checksum of a `NeighbourRow`, then the row. A number that is odd while a row is written would
-do only where other processors see stores in their order; Arm does not promise that."""
+"""Checksum of a `NeighbourRow`, then the row. A sequence lock would need other processors to see
+stores in order, which Arm does not guarantee."""
 READS: Final = 5
-"""Reads of a row until it is whole; its writer may have died over it."""
+"""Maximum attempts to read a whole row; its writer may have died while writing."""
 _SIZE: Final = N_MODULES * _ROW.size
 
 
 class NeighbourRow(NamedTuple):
-    """One module, as its service wrote it."""
+    """State of one module, as its service wrote it."""
 
     t_ns: int
-    """Time of the drive's newest accepted sample; 0: none yet."""
+    """Time of the drive's newest accepted sample, ns; 0 before the first."""
     theta: float
     """rad"""
     rate: float
@@ -63,19 +63,19 @@ class NeighbourRow(NamedTuple):
     mode: int
     """`Mode`."""
     caught: int = 0
-    """1: in DAMP it no longer sinks: a knee that was caught, or a module that has stiffened."""
+    """1 in DAMP if it no longer sinks: a caught knee, or a module that has stiffened."""
     silent: int = 0
-    """1: its drive has been silent for `SILENT_NS`, and is not yet lost."""
+    """1 if its drive has been silent for `SILENT_NS`, and is not yet lost."""
 
 
 class NeighbourView(NamedTuple):
     """View of a module's neighbours."""
 
     leg: Pair | None = None
-    """Theta and rate of its leg, rad, rad/s: for a hip ankle and knee together, for an ankle the
-    knee; None: not known now."""
+    """Theta and rate of its leg, rad, rad/s: for a hip, ankle and knee together; for an ankle, the
+    knee; None if unknown."""
     sinks: bool = True
-    """For a knee: False if another module stays where it is; going on would tip the robot."""
+    """For a knee: False if another module stays where it is; sinking on would tip the robot."""
     stiffen: bool = False
     """True if another module is limp and this one must stiffen for it."""
 
@@ -84,7 +84,7 @@ UNKNOWN: Final = NeighbourView()
 
 
 def path_of(run_dir: Path) -> Path:
-    """Return where the six are kept."""
+    """Return the path of the shared file."""
     return live_dir(run_dir) / "joints.near"
 
 
@@ -93,11 +93,11 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
 
     Args:
         module: name of the viewing module.
-        rows: the six rows; None while one is being written, or if it never was.
+        rows: the six rows; None for a row that is being written or was never written.
         now_ns: the host's monotonic clock.
     """
     kind, own = kind_of(module), MODULE_INDEX[module]
-    heard = _fresh(rows[own], now_ns) is not None  # else all may stand still
+    heard = _fresh(rows[own], now_ns) is not None  # otherwise all services may have been paused
     limp = [
         wanted
         for row, wanted in zip(rows, SUPPORT_FOR, strict=True)
@@ -116,7 +116,7 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
             leg = (knee.theta, knee.rate)
     else:
         other = rows[(own + _LEG) % N_MODULES]
-        if other is not None and not _is_elsewhere(other, now_ns):  # to stop alone would tip it
+        if other is not None and not _is_elsewhere(other, now_ns):  # stopping alone tips the robot
             others = (row for at, row in enumerate(rows) if at != own and row is not None)
             sinks = not any(_stays(row, now_ns) for row in others)
     return NeighbourView(leg, sinks, stiffen)
@@ -128,7 +128,7 @@ def _fresh(row: NeighbourRow | None, now_ns: int) -> NeighbourRow | None:
 
 
 def _is_elsewhere(row: NeighbourRow, now_ns: int) -> bool:
-    """Return True for a module of another host, or of its clock."""
+    """Return True for a module on another host, or on another host's clock."""
     return row.t_ns == 0 or row.t_ns > now_ns + STALE_NS
 
 
@@ -140,26 +140,26 @@ def _stays(row: NeighbourRow, now_ns: int) -> bool:
 
 
 class Neighbours:
-    """A module's place in the file."""
+    """One module's access to the shared file."""
 
     def __init__(self, run_dir: Path, module: str) -> None:
-        """Open the file, or make it; the directory is there.
+        """Open the file, or create it; the directory must exist.
 
         Raises:
-            FleetError: it cannot be made.
+            FleetError: the file cannot be created.
         """
         self._memory = mapped(path_of(run_dir), _SIZE)
         self._module = module
         self._at = MODULES.index(module) * _ROW.size
 
     def write(self, row: NeighbourRow) -> None:
-        """Write down where this module is."""
+        """Write this module's row."""
         body = _BODY.pack(*row)
         self._memory[self._at : self._at + _ROW.size] = _SUM.pack(crc32(body)) + body
 
     @staticmethod
     def mode_of(run_dir: Path, module: str) -> Mode | None:
-        """Return the mode last written by a module's service on this host; None if none.
+        """Return the mode last written by a module's service on this host, or None.
 
         A row that is being written is read again.
         """
@@ -178,12 +178,12 @@ class Neighbours:
         return found
 
     def view(self, now_ns: int) -> NeighbourView:
-        """Return what this module knows of the others."""
+        """Return this module's view of the others."""
         return view_of(self._module, [self._read(at) for at in range(0, _SIZE, _ROW.size)], now_ns)
 
     def _read(self, at: int) -> NeighbourRow | None:
         row, whole = _unpacked(self._memory[at : at + _ROW.size])
-        return row if whole else None  # written meanwhile; the next cycle is 2 ms away
+        return row if whole else None  # being written; the next cycle is 2 ms away
 
 
 def _unpacked(data: bytes) -> tuple[NeighbourRow, bool]:

@@ -1,8 +1,7 @@
 """The local law of one module: diagonal PD plus feedforward (docs/law.md#references-and-age).
 
-A `Setpoint` is the law at one instant. Setpoints are closed under blending: a blend of
-two PD laws is the PD law of the blended gains, so what a drive's own loop can hold
-stays one law at every moment of a hand-over. Pure.
+A `Setpoint` is the law at one instant. A blend of two setpoints is again one PD law, with blended
+gains, so a drive's own loop can hold the law at every moment of a hand-over. Pure.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class Setpoint(msgspec.Struct, gc=False, frozen=True):
 def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
     """Return tau = k_p (q_ref - q) + k_d (v_ref - v) + tau_ff + tau_coupled, N m.
 
-    It is docs/law.md (13). Of a command: as it was when the planner sent it.
+    This is docs/law.md (13). For a command it is the torque at the time when the planner sent it.
     """
     s = setpoint
     return (
@@ -50,7 +49,7 @@ def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
 
 
 def extrapolate(command: JointCommand, age_s: float) -> Setpoint:
-    """Return the command's law at this age, references moved on by their rates: docs/law.md (21).
+    """Return the command's law at an age, references extrapolated by their rates: docs/law.md (21).
 
     Args:
         command: references and rates at age zero.
@@ -68,22 +67,22 @@ def extrapolate(command: JointCommand, age_s: float) -> Setpoint:
 
 
 def stand(q: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
-    """Return the law of a stand at q with no planner."""
+    """Return the law for standing at q without a planner."""
     return Setpoint(q, ZERO, ZERO, ZERO, k_p, k_d)
 
 
 def take_over(q: Pair, v: Pair, tau: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
-    """Return the law of a stand at q that at a rate v gives tau: frozen, v_ref will fade."""
+    """Return the law for standing at q that gives tau at rate v; once frozen, v_ref fades."""
     return Setpoint(q, v, tau, ZERO, k_p, k_d)
 
 
 def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
-    """Return a setpoint frozen: q_ref, tau_ff and gains stay, the rest fades.
+    """Return a frozen setpoint: q_ref, tau_ff and gains stay, the rest fades.
 
     Args:
         setpoint: the setpoint when the references froze.
-        moving_share: fraction of v_ref and tau_coupled that is left, 1 .. 0. v_ref fades too,
-            because in the middle of a squat k_d v_ref is 10 N m, a blow if dropped at once.
+        moving_share: fraction of v_ref and tau_coupled that is left, 1 .. 0. v_ref fades too: in
+            mid-squat k_d v_ref is 10 N m, which would be a jolt if dropped at once.
     """
     s, share = setpoint, moving_share
     if share <= 0.0:
@@ -96,7 +95,7 @@ def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
 def raise_gains(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoint:
     """Return a setpoint whose gains have risen by `share` (0 .. 1) to at least k_p and k_d.
 
-    Gains only ever rise: adding to D can only add to the stiffness that stands.
+    Gains only rise: a larger D can only add to the stiffness that holds the robot up.
     """
     s = setpoint
     return Setpoint(
@@ -116,16 +115,16 @@ def raise_gains(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpo
 
 
 def limit_stiffening(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -> Setpoint:
-    """Return a setpoint that may stiffen: no spring then pulls harder by more than `added_max`.
+    """Return a setpoint for which stiffening adds at most `added_max` to a spring's torque.
 
-    An axis that is too far from its reference for that holds its position: its spring's torque
+    An axis that is too far from its reference holds its position instead: its spring's torque
     becomes feedforward, so the torque does not change.
 
     Args:
         setpoint: the present setpoint.
         q: joint angles, rad.
         k_p: gains to which it will rise, N m/rad.
-        added_max: most added torque of a spring, N m.
+        added_max: maximum torque that stiffening may add to a spring, N m.
     """
     s = setpoint
     away = (s.q_ref[0] - q[0], s.q_ref[1] - q[1])
@@ -143,8 +142,8 @@ def limit_stiffening(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -
 def load_to_feedforward(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
     """Return a setpoint in which the sinking axes carry their load as feedforward.
 
-    DAMP removes their springs but not the load: a stand without a planner has no other
-    feedforward to fade.
+    DAMP removes their springs but not the load. A robot that stands without a planner has no other
+    feedforward that could fade.
 
     Args:
         setpoint: the present setpoint.
@@ -222,7 +221,7 @@ def _mix(a: Pair, b: Pair, share: float) -> Pair:
 
 
 def _mix_weighted(a: Pair, b: Pair, w_a: Pair, w_b: Pair, w: Pair, share: float) -> Pair:
-    """Mix two references by share and gain; with no gain at all the reference is b."""
+    """Mix two references by share and gain; without any gain, the reference is b."""
     rest = 1.0 - share
     return (
         (rest * w_a[0] * a[0] + share * w_b[0] * b[0]) / w[0] if w[0] > 0.0 else b[0],

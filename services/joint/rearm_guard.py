@@ -1,24 +1,24 @@
-"""State that a joint service keeps in shared memory, without a bus: four things in a few bytes.
+"""Shared memory in which a joint service keeps four values in a few bytes, without a bus.
 
-The first is the last state of a service, for its successor. A module that lost torque is never
-re-armed automatically (`shared.robot.fault_table`). The supervisor restarts a service that crashed,
-and meanwhile its drive may have disarmed or an emergency stop may hold: the new service would arm
-and stiffen the module unasked. So each service writes its last state, and a person who asks for the
+The first is the service's last state, for its successor. A module that lost torque is never
+re-armed automatically (`shared.robot.fault_table`). But the supervisor restarts a service that
+crashed, and meanwhile its drive may have disarmed or an emergency stop may be active. Without the
+last state, the new service would arm and stiffen the module unasked. A person who requests the
 module (`xrl kill`, `xrl start`, `xrl up`) clears it.
 
-The second is the emergency stop of someone on the robot's own host (`xrl estop`). It works with the
-planner dead and every link of the bus cut, and holds until a person restarts the module.
+The second is an emergency stop from the robot's own host (`xrl estop`). It works with the planner
+dead and every link of the bus cut, and stays active until a person restarts the module.
 
-The third is the pendant's count of beats (see below), the fourth who engaged the
-emergency stop that holds, however it came, for `xrl status`.
+The third is the pendant's count of beats (see below). The fourth is who engaged the active
+emergency stop, on whatever path, for `xrl status`.
 
 The file is mapped: reading and writing it are loads and stores, which the control path may do.
 
-The pendant is a dead man's handle: all six modules stop when it falls silent. Whatever fails
-between the person's hand and the robot, a cable, a radio or a host, shows as silence. The pendant
-beats in each module's shared memory, without a bus. A pendant that was never there, or was laid
-down in order, is not missed. Silence is counted in cycles of the module, so a pause of the whole
-machine does not count.
+The pendant is a dead man's handle: all six modules stop when it falls silent. Any failure between
+the person's hand and the robot (cable, radio or host) shows as silence. The pendant beats in each
+module's shared memory, without a bus. A pendant that was never there, or was laid down properly, is
+not missed. Silence is counted in the module's cycles, so a pause of the whole machine does not
+count.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from shared.run_directory import live_dir, mapped
 _LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
 _BEATS_AT: Final = 8
-"""Aligned, so that a store of it is whole."""
+"""Aligned, so that a store of it is atomic."""
 _SOURCE_AT: Final = _BEATS_AT + _BEATS.size
 SOURCE_MAX: Final = 80
-"""Bytes of a stop's source that are kept."""
+"""Maximum length of a stop's source, bytes."""
 _NEW: Final = bytes(_SOURCE_AT + SOURCE_MAX)
 PENDANT: Final = "a pendant that went silent"
 
@@ -52,11 +52,11 @@ class LastState(IntEnum):
     """Last state of the service before this one."""
 
     NOTHING = 0
-    """There was none, or it ended in order, or a person has asked for the module."""
+    """There was no service, it ended in order, or a person has requested the module."""
     HELD = 1
-    """It held the robot: a drive that is no longer armed lost torque."""
+    """It held the robot: a drive that is no longer armed has lost torque."""
     DAMP = 2
-    """It sank after an emergency stop: so does the next."""
+    """It sank after an emergency stop, and so must the next service."""
 
 
 def path_of(run_dir: Path, module: str) -> Path:
@@ -68,10 +68,10 @@ class RearmGuard:
     """A module's rearm guard, a file in its run directory that processes map."""
 
     def __init__(self, run_dir: Path, module: str) -> None:
-        """Open it, or make it; the directory is there.
+        """Open the file, or create it; the directory must exist.
 
         Raises:
-            FleetError: it cannot be made.
+            FleetError: the file cannot be created.
         """
         self._memory = mapped(path_of(run_dir, module), len(_NEW))
         self._written = self.read()
@@ -82,21 +82,21 @@ class RearmGuard:
         return LastState(value) if value in tuple(LastState) else LastState.HELD
 
     def write(self, last_state: LastState) -> None:
-        """Write the last state; an equal value is not written again.
+        """Write the last state if it has changed.
 
-        So a running service without a change does not undo `clear`.
+        A running service without a change therefore does not undo `clear`.
         """
         if last_state is not self._written:
             self._memory[_LAST_STATE] = self._written = last_state
 
     def note_stop(self, source: str) -> None:
-        """Keep who engaged the emergency stop; the first one that is named stays."""
+        """Store who engaged the emergency stop; the first name stays."""
         if self._memory[_SOURCE_AT] == 0 and source:
             kept = _kept(source)
             self._memory[_SOURCE_AT : _SOURCE_AT + len(kept)] = kept
 
     def stop_on(self, number: signal.Signals) -> None:
-        """Engage the emergency stop at a signal: the memory outlives its file and the disk."""
+        """Engage the emergency stop on a signal: the memory outlives its file and the disk."""
 
         def engage(_number: int, _frame: FrameType | None) -> None:
             self._memory[_STOP] = 1
@@ -111,14 +111,14 @@ class RearmGuard:
 
     @property
     def beats(self) -> int:
-        """How often a pendant has beaten; 0: there is none."""
+        """Number of beats of the pendant; 0 without a pendant."""
         return int(_BEATS.unpack_from(self._memory, _BEATS_AT)[0])
 
 
 def clear(run_dir: Path, *modules: str) -> None:
-    """Clear the state of the modules' earlier services: a person asks for the modules.
+    """Clear the state of the modules' earlier services, because a person requests the modules.
 
-    It is cleared in place, because a running service has the file mapped. If a file cannot be
+    The files are cleared in place, because a running service has them mapped. If a file cannot be
     opened, none is cleared.
     """
     with ExitStack() as stack:
@@ -131,7 +131,7 @@ def clear(run_dir: Path, *modules: str) -> None:
 
 
 def stop_source(run_dir: Path, module: str) -> str:
-    """Return who engaged a module's emergency stop; empty: nobody, or he was not named."""
+    """Return who engaged a module's emergency stop; empty if unknown or not engaged."""
     try:
         with path_of(run_dir, module).open("rb") as file:
             file.seek(_SOURCE_AT)
@@ -148,20 +148,20 @@ def request_stop(run_dir: Path, module: str, source: str = "") -> bool:
     """Stop a module, with or without a bus; return False if it has no service on this host.
 
     Args:
-        run_dir: of its fleet.
-        module: its name.
-        source: who asks for it.
+        run_dir: the fleet's run directory.
+        module: name of the module.
+        source: who requests the stop.
 
     Raises:
-        OSError: the file is there and cannot be written.
+        OSError: the file exists but cannot be written.
     """
     path = path_of(run_dir, module)
     if not path.exists():
         return False
-    # whoever may stop the robot may not be the one who made the directory
+    # the user who stops the robot may not own the directory
     descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     try:
-        os.pwrite(descriptor, b"\x01", _STOP)  # first: a name is worth less than a stop
+        os.pwrite(descriptor, b"\x01", _STOP)  # first, because the stop matters more than the name
         if source and not os.pread(descriptor, 1, _SOURCE_AT).strip(b"\0"):
             os.pwrite(descriptor, _kept(source), _SOURCE_AT)
     finally:
@@ -170,10 +170,10 @@ def request_stop(run_dir: Path, module: str, source: str = "") -> bool:
 
 
 class Pendant:
-    """The pendant's end, for the modules whose services are on this host."""
+    """Sending side of the pendant, for the modules whose services are on this host."""
 
     def __init__(self, run_dir: Path, modules: Sequence[str]) -> None:
-        """Open the modules' files; those without one have no service here.
+        """Open the modules' files; a module without a file has no service here.
 
         Raises:
             OSError: a file is there and cannot be written.
@@ -196,33 +196,33 @@ class Pendant:
         return tuple(_BEATS.unpack_from(row, _BEATS_AT)[0] for row in self._memories.values())
 
     def beat(self) -> None:
-        """Say that it is held: from the first time on, its silence stops them."""
+        """Signal that the pendant is held; after the first beat, silence stops the modules."""
         self._beats += 1
         self._write_beats(self._beats)
 
     def lay_down(self) -> None:
-        """End the pendant's watch: nobody has to hold it any more."""
+        """End the pendant's watch: it no longer has to be held."""
         self._write_beats(0)
 
     def _write_beats(self, beats: int) -> None:
         for memory in self._memories.values():
-            # packing in place first writes zeros: for a reader there would be no pendant
+            # packing in place writes zeros first, which a reader takes for no pendant
             memory[_BEATS_AT : _BEATS_AT + _BEATS.size] = _BEATS.pack(beats)
 
 
 CYCLE_MAX_NS: Final = 20 * NS_PER_MS
-"""Most time between two cycles that counts as silence."""
+"""Maximum time between two cycles that counts as silence, ns."""
 
 
 class PendantWatch:
-    """Listens to it, for one module.
+    """Watches the pendant for one module.
 
     Attributes:
-        lost: True while there is one that has been silent for too long.
+        lost: True while a pendant has been silent for too long.
     """
 
     def __init__(self, silent_ms: float) -> None:
-        """Take how long it may be silent."""
+        """Set the maximum silence, ms."""
         self._silent_ns = round(silent_ms * NS_PER_MS)
         self._beats = 0
         self._last_ns = 0
@@ -230,11 +230,11 @@ class PendantWatch:
         self.lost = False
 
     def is_lost(self, now_ns: int, beats: int) -> bool:
-        """Take one cycle; return `lost`.
+        """Count one cycle; return `lost`.
 
         Args:
             now_ns: this module's clock.
-            beats: `RearmGuard.beats`, in each cycle.
+            beats: `RearmGuard.beats` in this cycle.
         """
         if beats == self._beats:
             self._silence_ns += min(CYCLE_MAX_NS, now_ns - self._last_ns)

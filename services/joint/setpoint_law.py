@@ -1,9 +1,9 @@
 """The setpoint of each instant: TRACK follows the planner, HOLD freezes, DAMP sinks. Pure.
 
-After a fall a module in DAMP only damps: docs/hazards.md has the figures that chose this.
+After a fall, a module in DAMP only damps; docs/hazards.md has the figures behind this choice.
 
-A change of mode freezes the setpoint in force; the new mode starts from it, so that no change makes
-a torque step.
+A change of mode freezes the present setpoint. The new mode starts from it, so no change makes a
+torque step.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ class SetpointState(msgspec.Struct, kw_only=True):
     frozen: Setpoint
     """The setpoint at the last change of mode: HOLD keeps it, TRACK blends from it."""
     current: Setpoint
-    """The last cycle's."""
+    """The setpoint of the last cycle."""
     changed_ns: int = 0
     """Time of the last change of mode."""
     stiffened_ns: int = 0
-    """When it began to stiffen because another module may be limp; 0: it does not."""
+    """Time at which it began to stiffen because another module may be limp; 0 if it has not."""
     sinking: SinkingState
 
     @property
@@ -46,7 +46,7 @@ class SetpointLaw:
     """Chooses and blends a module's setpoints."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Take the module's gains and times; start at the stand gains."""
+        """Read the module's gains and times."""
         service, stand = config.joint_service, config.stand_gains(module)
         self.stand_k_p, self.stand_k_d = stand.k_p, stand.k_d
         self._support_k_p, self._support_k_d = config.support_gains(module)
@@ -65,7 +65,7 @@ class SetpointLaw:
         return SetpointState(frozen=here, current=here, sinking=self._sinking.start())
 
     def age_s(self, command: JointCommand, now_ns: int) -> float:
-        """Return a command's age, s, as far as it is extrapolated: docs/law.md (22)."""
+        """Return the age, s, to which a command is extrapolated: docs/law.md (22)."""
         return min(self._aging_max_s, (now_ns - command.echo_t_ns) / NS_PER_S)
 
     def is_settled(self, s: SetpointState, now_ns: int) -> bool:
@@ -73,7 +73,7 @@ class SetpointLaw:
         return now_ns - s.changed_ns >= self._blend_ns
 
     def start(self, s: SetpointState, mode: Mode, now_ns: int, setpoint: Setpoint) -> None:
-        """Start a mode from a given setpoint: until now the module was DISARMED."""
+        """Start a mode from a given setpoint, after DISARMED."""
         _note_change(s, mode, now_ns)
         s.frozen = s.current = setpoint
 
@@ -81,7 +81,7 @@ class SetpointLaw:
         """Freeze the setpoint in force for a new mode.
 
         Args:
-            s: the setpoints, which change.
+            s: the setpoints, updated in place.
             mode: the new mode.
             now_ns: this module's monotonic clock.
             q: joint angles (phi, theta), rad.
@@ -105,11 +105,11 @@ class SetpointLaw:
         """Return the setpoint of this instant.
 
         Args:
-            s: the setpoints, which change.
+            s: the setpoints, updated in place.
             now_ns: this module's monotonic clock.
             failsafe: mode and newest command.
             q: joint angles (phi, theta), rad.
-            near: what is known of the other modules on this host.
+            near: view of the other modules on this host.
         """
         mode = failsafe.mode
         if failsafe.limp and mode is _DAMP:
@@ -150,7 +150,7 @@ class SetpointLaw:
     def _bound_stiffening(self, s: SetpointState, now_ns: int, q: Pair) -> None:
         """Bound the torque that HOLD's springs add as they rise to their support gains.
 
-        A hip whose theta is soft may be far from its reference: a hand has turned the torso.
+        A hip with a soft theta may be far from its reference because a hand has turned the torso.
         """
         held = self._held(s, now_ns - s.changed_ns)
         near = pd_law.limit_stiffening(held, q, self._support_k_p, self._hold_torque)
@@ -158,7 +158,7 @@ class SetpointLaw:
             s.frozen, s.changed_ns = near, now_ns
 
     def _held(self, s: SetpointState, since_ns: int) -> Setpoint:
-        """Return HOLD's setpoint: frozen, and some gains rise to the stand gains."""
+        """Return HOLD's setpoint: frozen, while some gains rise to the stand gains."""
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._stiffen_ns)
         frozen = pd_law.freeze(s.frozen, moving)

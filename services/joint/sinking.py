@@ -1,19 +1,19 @@
-"""DAMP: how a module sinks after an emergency stop, knowing only its own leg. Pure.
+"""DAMP: sinking of a module after an emergency stop, from the angles of its own leg. Pure.
 
-Every phi holds. The theta axes of `damp_sinks` lose their stiffness and carry their load
-as feedforward that fades: a slow sink, never a drop. A knee is caught at its stop, or at its
-present angle when another module does not go down with it. An ankle holds; as its knee folds, its
-reference turns so that the hip joint stays as far ahead of it as it was, and with it the COM:
+Every phi holds. The theta axes of `damp_sinks` lose their stiffness and carry their load as
+feedforward that fades, so they sink slowly and never drop. A knee is caught at its stop, or at its
+present angle if another module does not go down with it. An ankle holds. As its knee folds, its
+reference turns so that the hip joint, and with it the COM, stays as far ahead of the ankle as it
+was:
 
     ahead = l2 sin(ankle) + l1 sin(ankle + knee)
 
-A hip that knows the angles of ankle and
-knee holds the torso's attitude; a hip that does not know them damps, and the torso turns with the
-thighs (`services.joint.neighbours`).
+A hip that knows the angles of ankle and knee holds the torso's attitude. A hip that does not know
+them damps, and the torso turns with the thighs (`services.joint.neighbours`).
 
 A module that must stiffen for a limp one stops sinking: it holds its position with its support
-gains (`RobotConfig.support_gains`) and the load that it carries, feedforward or the spring of a
-stop. A leg with a limp knee stands as a strut only on a stiff hip.
+gains (`RobotConfig.support_gains`) and keeps its load as feedforward, also that of a stop's spring.
+A leg with a limp knee stands as a strut only on a stiff hip.
 """
 
 from __future__ import annotations
@@ -33,45 +33,45 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 
 DOUBT_NS: Final = 100 * NS_PER_MS
-"""Time for which a reason to hold must last: a stop does not reach all six in the same cycle, and
-services pause."""
+"""Time for which a reason to hold must last, ns: a stop does not reach all six in the same cycle,
+and services pause."""
 LOW_M: Final = 0.1
-"""A hip joint that is lower above its ankle is on the floor."""
+"""Height of a hip joint above its ankle, m; below it the robot is on the floor."""
 LEAST_M: Final = 1e-6
-"""A leg folded onto itself has no direction."""
+"""Minimum length of a leg, m; a leg folded onto itself has no direction."""
 LEVEL_MAX: Final = 0.1
-"""rad; a torso that is farther off is brought back no harder than that."""
+"""Maximum attitude error that is corrected, rad; a larger error is not corrected harder."""
 
 
 class SinkingState(msgspec.Struct):
     """State of `Sinking`."""
 
     stop: float | None = None
-    """Where a knee is caught, rad; None: nowhere."""
+    """Angle at which a knee is caught, rad; None without a stop."""
     upright: float | None = None
-    """How the torso stood as it began, the leg's thetas together, rad; None: not known."""
+    """Torso's attitude at the start, as the sum of the leg's thetas, rad; None if unknown."""
     held: Setpoint | None = None
-    """The setpoint from which it stiffens for a limp module, at the angles that it had then, its
-    load as feedforward; None: it does not."""
+    """Setpoint from which it stiffens for a limp module, at the angles of that moment, with its
+    load as feedforward; None if it does not stiffen."""
     below: float | None = None
-    """`NeighbourView.leg`'s angle when that was known last, rad; None: never."""
+    """Last known angle of `NeighbourView.leg`, rad; None before the first."""
     caught: bool = False
-    """True if a knee does not sink any more for the others' sake."""
+    """True if a knee no longer sinks because another module does not."""
     doubt_ns: int = -1
-    """Since when there is reason to, from the beginning on; -1: there is none."""
+    """Time after the start since which there is a reason to hold, ns; -1 without one."""
     held_ns: int = -1
-    """When `held` was taken, from the beginning on; -1: it was not."""
+    """Time after the start at which `held` was set, ns; -1 before."""
     ahead: float | None = None
-    """How far ahead of an ankle its hip joint is to stay, m; None: not known."""
+    """Distance that the hip joint must stay ahead of its ankle, m; None if unknown."""
     start: float = 0.0
-    """The ankle's theta when that was found, rad."""
+    """The ankle's theta when that distance was measured, rad."""
 
 
 class Sinking:
-    """One module's way down."""
+    """Sinking law of one module."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Take times and gains."""
+        """Read times and gains."""
         service, kind = config.joint_service, kind_of(module)
         stand = config.stand_gains(module)
         self._k_p, self._k_d = stand.k_p, stand.k_d
@@ -112,10 +112,10 @@ class Sinking:
         """Return the local law.
 
         Args:
-            s: state of the sinking, which changes.
+            s: state of the sinking, updated in place.
             frozen_setpoint: the setpoint that `begin` returned.
             current: the setpoint in force until now.
-            since_ns: time since then, ns.
+            since_ns: time since `begin`, ns.
             q: joint angles, rad.
             near: view of the other modules.
         """
@@ -140,19 +140,19 @@ class Sinking:
     def _sunk(self, frozen_setpoint: Setpoint, since_ns: int) -> Setpoint:
         """Return the law of sinking."""
         share = max(0.0, 1.0 - since_ns / self._fade_ns)
-        risen = min(1.0, since_ns / self._blend_ns)  # at once it was a step of 33 N m
+        risen = min(1.0, since_ns / self._blend_ns)  # without the ramp a step of 33 N m
         held = pd_law.freeze(frozen_setpoint, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
         held = pd_law.raise_gains(held, self._k_p, self._k_d, 1.0 - share)
         return pd_law.damp(held, self._sinks, self._damp_k_d, share, risen)
 
     def _carried(self, current: Setpoint, q: Pair) -> Setpoint:
-        """Return a setpoint with the same torque that holds the axes that sink where they are."""
+        """Return a setpoint of the same torque that holds the sinking axes where they are."""
         carried = pd_law.load_to_feedforward(current, self._sinks, q)
         theta = q[1] if self._sinks[1] else carried.q_ref[1]
         return msgspec.structs.replace(carried, q_ref=(carried.q_ref[0], theta))
 
     def _stiffened(self, held: Setpoint, after_ns: int) -> Setpoint:
-        """Return the law of a module that has held for `after_ns` with the load it had then."""
+        """Return the law of a module that has stiffened for `after_ns`, with its initial load."""
         start = pd_law.freeze(held, max(0.0, 1.0 - after_ns / self._coupled_ramp_ns))
         stands = pd_law.stand(held.q_ref, *self._support)
         stands = msgspec.structs.replace(stands, tau_ff=held.tau_ff)
@@ -161,7 +161,7 @@ class Sinking:
     def _levelled(
         self, s: SinkingState, sunk: Setpoint, theta: float, near: NeighbourView, risen: float
     ) -> Setpoint:
-        """Return the law of a hip; if its leg is no longer seen, the leg's last angle holds."""
+        """Return the law of a hip; without new angles of its leg, the last ones apply."""
         rate = 0.0
         if near.leg is not None:
             s.below, rate = near.leg
@@ -176,7 +176,7 @@ class Sinking:
     def _placed(
         self, s: SinkingState, sunk: Setpoint, theta: float, near: NeighbourView
     ) -> Setpoint:
-        """Return the law of an ankle; if its knee is no longer seen, its last angle holds."""
+        """Return the law of an ankle; without a new angle of its knee, the last one applies."""
         rate = 0.0
         if near.leg is not None:
             knee, rate = near.leg
@@ -193,7 +193,7 @@ class Sinking:
         place = math.asin(s.ahead / length) - math.atan2(across, along)
         low, high = self._limits
         place = clamp(place, min(low, s.start), max(high, s.start))
-        wanted = sunk.q_ref[1] + place - s.start  # its spring goes on carrying its load
+        wanted = sunk.q_ref[1] + place - s.start  # its spring keeps carrying its load
         up = self._thigh * math.cos(place + s.below)
         height = self._shank * math.cos(place) + up
         v_ref = -rate * up / height if height > LOW_M else 0.0

@@ -1,7 +1,7 @@
-"""Writes down what each cycle was given and decided, so that it can be executed again. Pure.
+"""Records each cycle's inputs and decisions, so that it can be re-executed. Pure.
 
-The order in which a service took its inputs is nowhere else: in the log's order 22 to 97 % of the
-ticks came out wrong (docs/logs.md).
+Nothing else records the order in which a service took its inputs: in the log's order, 22 to 97 % of
+the ticks came out wrong (docs/logs.md).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from shared.bus.messages import JointCommand, Pair
 from shared.bus.traces import CycleTrace, JointTrace
 
 CYCLES: Final = 10
-"""Cycles in a message; these are lost with a killed service."""
+"""Cycles in a message; a killed service loses the unsent ones."""
 SNAPSHOT_EVERY: Final = 50
-"""Messages between two with the service's snapshot: 1 s."""
+"""Messages from one snapshot of the service to the next: 1 s."""
 
 _NOTHING: Final = (0.0, 0.0)
 _UNTOLD: Final = (-1.0, -1.0)
@@ -28,15 +28,15 @@ _UNTOLD: Final = (-1.0, -1.0)
 _Cycle = tuple[
     int, DriveReading | None, JointCommand | None, bool, DriveAction, NeighbourView, int, int, Pair
 ]
-"""A cycle's inputs and outcome as they are: turned into a message ten at a time, which is cheaper
-than once in each cold cycle."""
+"""A cycle's raw inputs and outcome. Ten at a time are turned into a message, which is cheaper than
+converting in each cold cycle."""
 
 
 class Tracer:
-    """Gathers the cycles of one module's service."""
+    """Collects the cycles of one module's service."""
 
     def __init__(self, module: DriveManager) -> None:
-        """Begin before the first cycle."""
+        """Start before the first cycle."""
         self._module = module
         self._encode = msgspec.json.Encoder().encode
         self._cycles: list[_Cycle] = []
@@ -55,13 +55,13 @@ class Tracer:
         malformed: int = 0,
         ended: int = 0,
     ) -> JointTrace | None:
-        """Take down a cycle; return a message when it is full."""
+        """Record a cycle; return a message when it is full."""
         tau = self._module.state.controller.tau
         self._cycles.append((now_ns, reading, command, estop, step, near, malformed, ended, tau))
         return self.take() if len(self._cycles) == CYCLES else None
 
     def take(self) -> JointTrace | None:
-        """Return what has been gathered, if there is anything."""
+        """Return the cycles recorded since the last message, or None."""
         if not self._cycles:
             return None
         self._seq += 1

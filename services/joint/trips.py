@@ -1,16 +1,16 @@
-"""Trips that a joint service detects by itself: it then holds, whatever its planner sends. Pure.
+"""Trips that a joint service detects on its own; it then holds, whatever its planner sends. Pure.
 
-With gains that do not suit its drivetrain the robot shakes within a tenth of a second of being led,
-and only the six services see it at 500 Hz. Each watches its own torque and speed while it
-tracks (`shared.robot.trip_table`; limits: [trips] of the robot file):
+With gains that do not suit its drivetrain, the robot shakes within 0.1 s of being led, and only the
+six services see that, at 500 Hz. Each service watches its own torque and speed while it tracks
+(`shared.robot.trip_table`; limits: [trips] of the robot file):
 
-    shaking   torque above `SHAKE_ABOVE_HZ`, as the root of its mean square over `SHAKE_S`
-    torque    a motor at the limit of the torque diamond, for long
+    shaking   RMS of the torque above `SHAKE_ABOVE_HZ`, over `SHAKE_S`
+    torque    a motor that stays at the limit of the torque diamond
     speed     a joint that turns faster than it is ever led
 
-The law's own torques end at some 4 Hz (`GainSchedule.coupling_bandwidth_hz`). Led, pushed with
-75 % of what soles and motors bear and on plants with every error drawn, shaking reached 4 N m; on
-the drivetrains on which the unfiltered law falls it is 55 to 77 N m, and 15 after 20 to 60 ms.
+The law's own torques end at about 4 Hz (`GainSchedule.coupling_bandwidth_hz`). Led, pushed with
+75 % of what soles and motors bear, and on plants with every error drawn, shaking reached 4 N m. On
+the drivetrains on which the unfiltered law falls it is 55 to 77 N m, and 15 N m after 20 to 60 ms.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from shared.config.robot_config import RobotConfig
 from shared.robot import trip_table
 
 SHAKE_ABOVE_HZ: Final = 8.0
-"""Above the law's band: the coupled torque's low-pass and a hand lie below it."""
+"""Above the law's bandwidth, and above the coupled torque's low-pass and a hand."""
 SHAKE_S: Final = 0.1
 """Time constant of the mean square."""
 AT_LIMIT: Final = 0.995
-"""Share of the torque diamond: a motor there gives all it has."""
+"""Share of the torque diamond at which a motor counts as at its limit."""
 _NONE: Final = Event.NONE  # returned in each cycle: docs/contributing.md
 
 
 class _TripLimits(msgspec.Struct, frozen=True):
-    """When a module trips."""
+    """Trip limits of a module."""
 
     slow_share: float
-    """How far the slow part of the torque follows it in a cycle."""
+    """Low-pass coefficient of the torque's slow part, per cycle."""
     mean_share: float
-    """And the mean square of the rest."""
+    """Low-pass coefficient of the rest's mean square, per cycle."""
     shaking: float
     """(N m)^2"""
     torque: float
@@ -67,24 +67,24 @@ def limits_of(config: RobotConfig) -> _TripLimits:
 
 
 class JointTrips(msgspec.Struct):
-    """What has been seen since the module began to track."""
+    """Measurements since the module began to track."""
 
     slow: Pair = (0.0, 0.0)
     """Torque below `SHAKE_ABOVE_HZ`, N m."""
     mean: Pair = (0.0, 0.0)
     """Mean square of the rest, (N m)^2."""
     at_limit_ns: int = 0
-    """Since when the torque is at its limit; 0: it is not."""
+    """Time since which the torque is at its limit, ns; 0 if it is not."""
     fast_ns: int = 0
-    """Since when the joint turns too fast; 0: it does not."""
+    """Time since which the joint turns too fast, ns; 0 if it does not."""
 
-    def rest(self, tau: Pair) -> None:
-        """Begin again from the torque that the drive gives, N m: nothing is judged before TRACK."""
+    def reset(self, tau: Pair) -> None:
+        """Restart from the drive's torque, N m: nothing trips before TRACK."""
         self.slow, self.mean = tau, (0.0, 0.0)
         self.at_limit_ns = self.fast_ns = 0
 
     def judge(self, now_ns: int, tau: Pair, v: Pair, limits: _TripLimits) -> Event:
-        """Take one cycle of TRACK; return SHAKING, TORQUE_LIMIT, TOO_FAST or NONE.
+        """Judge one cycle of TRACK; return SHAKING, TORQUE_LIMIT, TOO_FAST or NONE.
 
         Args:
             now_ns: this module's clock.

@@ -1,14 +1,17 @@
-"""Whether an encoder may have missed whole turns of its motor. Pure.
+"""Detects that an encoder may have missed whole turns of its motor. Pure.
 
-The drive adds up differences of the encoder's angle within the turn, each the short way round. When
-no words come, for up to 51 ms without an error, the count stays where it was. After more than half
-a turn it goes on the wrong way, and the joint is 0.18 rad off in phi and in theta. The angle within
-the turn cannot show that: the count is off by whole turns. The motion can. An axis that stands
-exactly still right after it was fast has had no words; how far it may have gone since is bounded by
-its speed before and `ACCELERATION`.
+The drive adds up differences of the encoder's angle within the turn, each the short way round. If
+no words arrive, for up to 51 ms without an error, the count stays where it was. After more than
+half a turn, the count continues the wrong way, and the joint is 0.18 rad off in phi and in theta.
+The angle within the turn cannot show that, because the count is off by whole turns. The motion can:
+an axis that stands exactly still right after it was fast has received no words. How far it may have
+moved since is bounded by its earlier speed and `ACCELERATION`.
 
-An encoder without power reads 0, which passes the parity check: the count then rests where the
-angle within the turn is 0, and no error ever comes.
+An encoder without power reads 0, which passes the parity check. The count then rests where the
+angle within the turn is 0, and no error is ever reported. A live motor may rest there too: of 960
+drawn crouches of 10 s, in six one of the twelve did. While the drive is armed, turns therefore
+count as lost only if the estimate also jumped there, or if the motor's torque changes by more than
+stiction and the estimate does not. Before that, a motor that rests there does not arm.
 """
 
 from __future__ import annotations
@@ -20,65 +23,82 @@ import msgspec
 from shared.clock import NS_PER_MS, NS_PER_S
 
 ACCELERATION: Final = 400.0
-"""turn/s^2: a motor's largest while the robot stands or one leg is limp (144 was measured)."""
+"""Maximum of a motor while the robot stands or one leg is limp, turn/s^2 (measured: 144)."""
 FADES: Final = 200.0
-"""turn/s^2: how fast bounds of the speed follow it inwards."""
+"""Rate at which the bounds of the speed close in on it, turn/s^2."""
 STILL: Final = 2e-5
-"""turns: a third of a count of 16384, to which the estimate settles after the last word."""
+"""Largest change at rest, turns: a third of a count of 16384; estimates settle to it."""
 STILL_NS: Final = 4 * NS_PER_MS
-"""An estimate that has not changed for so long does not follow an encoder."""
+"""Time without a change after which an estimate does not follow an encoder, ns."""
 SAMPLE_NS: Final = 4 * NS_PER_MS
-"""A longer time without a sample is the link's: the drive counts on."""
+"""Maximum time between samples, ns; after a longer one the link failed, and the drive counts on."""
 SETTLES_S: Final = 0.008
-"""s: the estimate rests so long after the last word at most."""
+"""Maximum time from the last word until the estimate rests, s."""
 GAP_NS: Final = 53 * NS_PER_MS
-"""A longer gap the drive reports itself, after 51 ms; a longer rest without an error is one."""
+"""Maximum gap, ns: the drive reports a longer one after 51 ms, so a longer rest is real."""
 AT_ZERO: Final = 2e-4
-"""turns: three counts of 16384. Single precision at the mark of 64 turns resolves 8e-6."""
+"""Tolerance, turns: three counts of 16384; single precision at the mark of 64 resolves 8e-6."""
+JUMPED: Final = 1.0
+"""Speed of the estimate shortly before the rest, turn/s, that shows a jump: of 0.003 turns or more,
+at the estimator's bandwidth of 1000 rad/s. A smaller jump turns a joint by 0.5 mrad at most."""
+PEAK_FADES: Final = 10.0
+"""Rate at which that speed is forgotten, turn/s^2."""
+STICTION: Final = 5.0
+"""Change of tau_theta + tau_phi (or minus, for the second motor), N m, that moves a live motor by
+more than `STILL`, through its friction and the drivetrain's flex."""
 UNKNOWN: Final = -1.0
 """Value of `encoder_zero` before the drive has answered."""
 
 
 class TurnWatch(msgspec.Struct):
-    """What one axis's estimates have shown, turns and turn/s."""
+    """History of one axis's estimates, turns and turn/s."""
 
     pos: float = 0.0
     changed_ns: int = 0
-    """Since when the estimate is what it is; 0: nothing has been seen."""
+    """Time of the estimate's last change, ns; 0 before the first sample."""
     slowest: float = 0.0
     fastest: float = 0.0
     """Bounds of the speed that the motor may have had when the estimate came to rest."""
     newest_ns: int = 0
+    peak: float = 0.0
+    """Highest recent speed when the estimate last changed."""
+    torque: float = 0.0
+    """Torque of the motor then, as for `STICTION`."""
     encoder_zero: float = UNKNOWN
-    """Where the encoder's angle within the turn is 0, modulo a turn."""
+    """Position at which the encoder's angle within the turn is 0, modulo a turn."""
     moved: bool = False
-    """It went further than it can while nobody controlled it: by a new zero, or by turns that are
-    missing. A count that is set moves `encoder_zero`, a missing turn does not."""
+    """True after an impossible jump while the module was not controlled: by a new zero, or by
+    missing turns. Setting the count moves `encoder_zero`; a missing turn does not."""
     lost: bool = False
-    """Turns may be missing, until the drive has no zero any more."""
+    """True if turns may be missing, until the drive's zero is cleared."""
 
-    def take(self, t_ns: int, pos: float, vel: float, jump: float, free: float) -> bool:
-        """Take a sample; return True if the motor can have come there.
+    def process(
+        self, t_ns: int, pos: float, vel: float, jump: float, free: float, torque: float | None
+    ) -> bool:
+        """Process a sample; return True if the motor can have reached it.
 
         Args:
-            t_ns: its time.
+            t_ns: time of the sample.
             pos: turns.
             vel: turn/s.
-            jump: from the sample that was accepted last, turns.
-            free: largest jump of a motor whose encoder was read all the time, turns.
+            jump: change since the last accepted sample, turns.
+            free: largest possible jump while the encoder is read all the time, turns.
+            torque: of the motor, as for `STICTION`, N m; None while the drive is not armed.
         """
         dt_s = (t_ns - self.newest_ns) / NS_PER_S
         possible = -free <= jump <= free
         if self.changed_ns and abs(pos - self.pos) <= STILL:
             if t_ns - self.changed_ns > GAP_NS:
                 self.slowest = self.fastest = 0.0
-                self.lost = self.lost or self.is_zero(pos)
+                dead = torque is None or self.peak > JUMPED or abs(torque - self.torque) > STICTION
+                self.lost = self.lost or (dead and self.is_zero(pos))
         else:
             rested_ns = self.newest_ns - self.changed_ns
             if self.changed_ns and STILL_NS <= rested_ns <= GAP_NS:
                 rested_ns += min(t_ns - self.newest_ns, SAMPLE_NS)
                 possible = self._explain(jump, rested_ns / NS_PER_S) or possible
-            self.pos, self.changed_ns = pos, t_ns
+            self.pos, self.changed_ns, self.torque = pos, t_ns, torque or 0.0
+            self.peak = max(abs(vel), self.peak - PEAK_FADES * dt_s)
             gains, fades = ACCELERATION * dt_s, FADES * dt_s
             slowest, fastest = self.slowest, self.fastest
             self.slowest = min(max(vel, slowest - gains), slowest + fades)
@@ -87,9 +107,9 @@ class TurnWatch(msgspec.Struct):
         return possible
 
     def _explain(self, jump: float, rested_s: float) -> bool:
-        """Return True if a jump after a rest is one way that the motor may have gone unseen.
+        """Return True if the motor may have made this jump unseen, during a rest of the estimate.
 
-        It has lost turns if another way, a turn longer or shorter, is possible too.
+        Turns may be lost if a jump that is one turn longer or shorter is possible too.
         """
         longest_s = rested_s + SETTLES_S
         gained = 0.5 * ACCELERATION * longest_s + FADES * SETTLES_S
@@ -106,7 +126,7 @@ class TurnWatch(msgspec.Struct):
         return self.encoder_zero != UNKNOWN and (off < AT_ZERO or off > 1.0 - AT_ZERO)
 
     def compare(self, encoder_zero: float) -> None:
-        """Take where the drive says that the encoder reads 0, turns."""
+        """Update the position at which the encoder reads 0, as the drive reports it, turns."""
         if self.moved and self.is_zero(encoder_zero):
             self.lost = True
         self.encoder_zero, self.moved = encoder_zero, False

@@ -1,1 +1,1 @@
-"""The network proxy: a bad network on purpose, on the wire between real processes."""
+"""Network proxy: impairs the links between real processes on purpose."""

@@ -1,6 +1,6 @@
 """`python -m services.network_proxy`: impairs the network between the services on purpose.
 
-Services dial it (`--injected`) in place of one another; `xrl inject` controls it.
+Services dial it instead of each other (`--injected`); `xrl inject` controls it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _UNIX = "unixsock-stream/"
 def main() -> int:
     """Run until SIGTERM or SIGINT; return the exit code."""
     parser = process.service_parser(__doc__ or "", "python -m services.network_proxy")
-    parser.add_argument("--seed", type=int, default=0, help="of what is lost, and how late (0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the losses and delays (0)")
     arguments = parser.parse_args()
     logger = log.setup("network_proxy")
     config = load(arguments.config)
@@ -46,17 +46,17 @@ def main() -> int:
         )
         commands = CommandHandler(impairments)
         control = ControlSocket(live_dir(arguments.run_dir) / SOCKET, commands.obey, watch)
-        logger.info("between %d pairs, priority %s", len(endpoints), granted)
+        logger.info("relaying between %d pairs of processes, priority %s", len(endpoints), granted)
         process.freeze_garbage()
         try:
             run(watch, relay, commands, impairments, stop)
         finally:
             control.close()
             relay.close()
-            impairments.clear("all", now_ns())  # the log is to have what each of them did
+            impairments.clear("all", now_ns())  # so that the log has the counts of each
             watch.close()
     logger.info(
-        "stopped: %d connections to a process that was not there, %d that stood still",
+        "stopped: %d connections refused, %d stuck connections closed",
         relay.refused,
         relay.stuck,
     )
@@ -64,7 +64,7 @@ def main() -> int:
 
 
 def _proxy_endpoint(pair: Pair, config: RobotConfig, run_dir: Path) -> ProxyEndpoint:
-    """Stand between two processes; BusError if that is not possible there."""
+    """Create the endpoint between two processes; BusError if that is not possible."""
     path = Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
     beyond = address_of(expand(config.bus.endpoints[pair.listens], run_dir))
     return ProxyEndpoint(pair, SocketListener(path), beyond)

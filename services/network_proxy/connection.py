@@ -1,9 +1,9 @@
-"""One connection of a pair: two ends, and each way what came in, when it goes out.
+"""One connection of a pair: its two ends, and the batches on their way in each direction.
 
-Zenoh's wire format: on a stream each batch is a length of two bytes, little endian, then as many
-bytes. A batch holds frames; a frame a header, a sequence number, extensions and network messages
-(zenoh-protocol, wire version 9). Messages of the application are PUSH; all else (opening a link,
-declaring subscriptions, keeping alive) is the link's own traffic. A datagram network would
+Zenoh's wire format (zenoh-protocol, wire version 9): on a stream, each batch is a length of two
+bytes, little endian, then that many bytes. A batch holds frames. A frame holds a header, a sequence
+number, extensions and network messages. Messages of the application are PUSH. All else (opening a
+link, declaring subscriptions, keep-alive) is the link's own traffic. A datagram network would
 retransmit it and a stream does not, so it may be late but never lost.
 """
 
@@ -20,11 +20,11 @@ from services.network_proxy.sockets import READ, WRITE, Ready, SocketWatch
 from shared.config.impairment import HELD, Direction, Impairer
 
 PENDING_MAX: Final = 262_144
-"""Due bytes that wait for a slow receiver. Above it the sender is no longer read, as on a direct
-link.
+"""Maximum due bytes that wait for a slow receiver. Above it the sender is no longer read, as on a
+direct link.
 """
 WAITING_MAX: Final = 4_194_304
-"""Bytes that are not due yet: then, too, the sender is read no more. Ten seconds of states."""
+"""Maximum bytes that are not due yet, before the sender is no longer read: 10 s of states."""
 _READ: Final = 65_536
 _LENGTH: Final = struct.Struct("<H")
 _ID: Final = 0x1F  # low five bits of every header
@@ -43,7 +43,7 @@ class Splitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return every batch that is whole now, each with its length before it."""
+        """Return every batch that is complete now, each with its length before it."""
         data = self._rest + data
         begin, batches = 0, []
         while begin + 2 <= len(data):
@@ -73,7 +73,7 @@ def carries_messages(batch: bytes) -> bool:
 
 
 def _number(batch: bytes, at: int) -> tuple[int, int]:
-    """Return a number of seven bits a byte, least significant first, and where it ends."""
+    """Return a number with seven bits per byte, least significant first, and where it ends."""
     value, shift = 0, 0
     while True:
         byte = batch[at]
@@ -100,12 +100,12 @@ class Waiting(NamedTuple):
 
     release_ns: int
     batch: bytes
-    """Empty: the end, seen on the other side as late as all else."""
+    """Empty for the end, which the other side sees as late as all else."""
     counted: Impairer | None = None
-    """Impairer that counted it as passed; None if none did, or for the second of a pair."""
+    """Impairer that counted it as passed; None without one, or for the second of a pair."""
 
     def count_lost(self) -> None:
-        """It never comes out, for its connection is gone: it is lost, and has not passed."""
+        """Count the batch as lost instead of passed, because its connection is gone."""
         if self.counted is not None:
             self.counted.drop()
 
@@ -116,9 +116,9 @@ class Flow:
     def __init__(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
         self.source, self.sink, self.direction = source, sink, direction
         self.ended = False
-        """The source has nothing more to say."""
+        """True once the source has ended."""
         self.broken = False
-        """The sink takes nothing any more. What comes is still read, to see its end."""
+        """True once the sink has failed; the source is still read, to see its end."""
         self._closing = False
         self._splitter = Splitter()
         self._held: list[Waiting] = []
@@ -130,7 +130,7 @@ class Flow:
         self._own_ns = 0
         """Release time of the newest batch of the link's own traffic."""
         self._stream_ns = 0
-        """When the last comes out that nothing may overtake."""
+        """Release time of the last batch that nothing may overtake."""
 
     @property
     def writes(self) -> bool:
@@ -139,16 +139,16 @@ class Flow:
 
     @property
     def reads(self) -> bool:
-        """True while the source is to be read: not while too much waits for the sink."""
+        """True while the source must be read: not while too much waits for the sink."""
         return not self.ended and len(self._pending) < PENDING_MAX and self._waits < WAITING_MAX
 
     @property
     def over(self) -> bool:
-        """True once the sink has all, and the end is due."""
+        """True once the sink has received all, and the end is due."""
         return self._closing and not self._pending
 
     def read(self, now_ns: int) -> list[Waiting]:
-        """Read what there is; return what waits now, in the order in which it came."""
+        """Read the available data; return the batches to release, in order of arrival."""
         found = self.release(now_ns)
         try:
             data = self.source.recv(_READ)
@@ -168,7 +168,7 @@ class Flow:
         return found + self._keep(rows)
 
     def release(self, now_ns: int) -> list[Waiting]:
-        """Release what a partition that is over has held back; it comes out like new batches."""
+        """Return batches that an ended partition held back, due like new batches."""
         impairer = self.direction.active
         if not self._held or (impairer is not None and impairer.what.partition):
             return []
@@ -203,10 +203,10 @@ class Flow:
             self._unsent.popleft()
 
     def stuck_ns(self, now_ns: int) -> int:
-        """Return for how long the sink has taken nothing of what waits for it.
+        """Return for how long the sink has accepted none of the waiting bytes.
 
-        Tried with each call: a UNIX socket is not called ready before most of it is read.
-        Measured from one call to the next.
+        Each call tries to write: a UNIX socket does not count as ready before most of it is read.
+        The time is measured from one call to the next.
         """
         if self._pending:
             self.flush()
@@ -255,19 +255,19 @@ class Flow:
         return found
 
     def _message(self, now_ns: int, batch: bytes) -> list[Waiting]:
-        """Return a message as often as it comes out; the first time is the one that counts."""
+        """Return a message once per release; only the first one counts."""
         impairer = self.direction.active
         times = sorted(self._not_before(t) for t in self.direction.passes(now_ns, len(batch)))
         return [Waiting(t, batch, None if n else impairer) for n, t in enumerate(times)]
 
     def _resumed(self, row: Waiting, now_ns: int) -> Waiting:
         release_ns = self._later(now_ns)
-        if row.counted is not None:  # a message that was held: it is on a stream
+        if row.counted is not None:  # a held message: it is on a stream
             self._stream_ns = release_ns
         return row._replace(release_ns=release_ns)
 
     def _later(self, now_ns: int) -> int:
-        """Return when what must not be lost comes out; in order with all that must not be."""
+        """Return the release time of a batch that must not be lost, in order with the others."""
         impairer = self.direction.active
         release_ns = now_ns if impairer is None else impairer.delays(now_ns)
         if release_ns != HELD:
@@ -291,10 +291,10 @@ class Flow:
 
 
 class Connection:
-    """Both flows, and when there is nobody left for them.
+    """Both flows of a connection, and whether they have ended.
 
-    `ends` are those of the dialling side and of the other, `directions` the impairments there and
-    back; `taken` is called with what a flow has read, and the time, ns.
+    `ends` are the sockets of the dialling side and of the other, `directions` the impairments there
+    and back. `taken` is called with what a flow has read, and the time, ns.
     """
 
     def __init__(
@@ -308,7 +308,7 @@ class Connection:
         there, back = Flow(first, second, directions[0]), Flow(second, first, directions[1])
         self.flows = (there, back)
         self.parted = False
-        """Closed; what waits for it is dropped."""
+        """True once it is closed; what waits for it is dropped."""
         self._watch, self._taken = watch, taken
         self._ready: tuple[Ready, Ready] = (
             partial(self._is_ready, there, back),
@@ -319,14 +319,14 @@ class Connection:
 
     @property
     def left(self) -> bool:
-        """True if a process has left it, though the other may not have seen it yet."""
+        """True if a process has left it, even if the other has not seen that yet."""
         return any(flow.ended for flow in self.flows)
 
     @property
     def over(self) -> bool:
-        """True once an end has received everything, or both have left: nobody receives the rest.
+        """True once an end has received everything, or both have left: none receives the rest.
 
-        Zenoh closes both ways at once: an end that sends no more does not receive either.
+        Zenoh closes both directions at once: an end that no longer sends does not receive either.
         """
         there, back = self.flows
         return there.over or back.over or (there.ended and back.ended)
@@ -353,9 +353,9 @@ class Connection:
             flow.drop()
 
     def _is_ready(self, source: Flow, sink: Flow, events: int, now_ns: int) -> None:
-        """Continue at an end: one flow reads there, the other writes."""
+        """Handle a ready end: one flow reads there, the other writes."""
         if self.parted:
-            return  # in this same turn
+            return  # it was parted earlier in this turn
         if events & WRITE:
             sink.flush()
         self._taken(self, source, source.read(now_ns) if events & READ else [], now_ns)

@@ -1,4 +1,4 @@
-"""What is asked of the network proxy: requests in, carried out, answers out. Never blocks."""
+"""Control of the network proxy: reads requests, executes them, replies. Never blocks."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from shared.network.proxy_protocol import (
 from shared.toml_file import check_ranges
 
 ASKED_MAX: Final = 64
-"""Impairments at once: each costs a little with every message, and a line in every answer."""
+"""Maximum number of impairments: each costs time with every message, and a line in every reply."""
 WAIT_MAX_S: Final = 86_400.0
-"""Latest begin, from now."""
+"""Maximum delay until an impairment starts, s."""
 
 
 class CommandHandler:
-    """Obeys, or says why not."""
+    """Executes requests, or replies why not."""
 
     def __init__(self, impairments: ImpairmentSchedule) -> None:
         self._injections = impairments
         self.changed = False
-        """An impairment has started or ended; the loop clears it."""
+        """True after an impairment has started or ended; the loop clears it."""
 
     def obey(self, request: Request) -> Reply:
-        """Carry a request out and reply with the impairments."""
+        """Execute a request and reply with the impairments."""
         at_ns = now_ns()
         try:
             if isinstance(request, Begin):
@@ -55,10 +55,10 @@ class CommandHandler:
         return Reply(requested=tuple(self._asked(at_ns)))
 
     def _problem(self, request: Begin) -> str:
-        """Return why not, empty if it can be done; ConfigError for a number out of its range."""
+        """Return why it is refused, empty if it is not; ConfigError for a number out of range."""
         check_ranges("inject", request.inject)
         if not 0.0 <= request.in_s <= WAIT_MAX_S:
-            return f"in {request.in_s:g} s; from now to {WAIT_MAX_S:g} s on"
+            return f"starts in {request.in_s:g} s; must be between 0 and {WAIT_MAX_S:g} s"
         if len(self._injections.requested) >= ASKED_MAX:
             return f"{ASKED_MAX} impairments are active or planned already; clear some first"
         return request.inject.fault()
@@ -92,7 +92,7 @@ _decode = msgspec.json.Decoder(Request).decode
 
 
 class _Asker:
-    """A client: the rest of its next request, and of the last reply."""
+    """A client, with the received part of a request and the unsent part of a reply."""
 
     def __init__(self, end: socket.socket) -> None:
         self.end = end
@@ -111,7 +111,7 @@ class _Asker:
         self.gone = not data or (len(self.half) > LINE_MAX and b"\n" not in self.half)
 
     def next_line(self) -> bytes | None:
-        """Return the next request; None: none is whole, or the last answer has not gone yet."""
+        """Return the next request; None if it is incomplete, or the last reply is not sent yet."""
         at = self.half.find(b"\n")
         if at < 0 or self.answer:
             return None
@@ -124,7 +124,7 @@ class _Asker:
             sent = self.end.send(self.answer)
         except BlockingIOError:
             return
-        except OSError:  # it did not wait for its answer
+        except OSError:  # it left before its reply
             self.gone = True
             self.half.clear()
             self.answer.clear()
@@ -133,10 +133,10 @@ class _Asker:
 
 
 class ControlSocket:
-    """A UNIX socket that takes one request a line."""
+    """A UNIX socket that reads one request per line."""
 
     def __init__(self, path: Path, obey: Callable[[Request], Reply], watch: SocketWatch) -> None:
-        """Listen; BusError if no socket can be made there."""
+        """Listen; BusError if the socket cannot be created."""
         self._obey, self._watch = obey, watch
         self._askers: list[_Asker] = []
         self._listener = SocketListener(path)
@@ -159,9 +159,9 @@ class ControlSocket:
         self._watch.want(end, READ, partial(self._is_ready, self._askers[-1]))
 
     def _is_ready(self, asker: _Asker, events: int, _now_ns: int) -> None:
-        """Go on with one: the answer first, and then the next request."""
+        """Serve one client: the reply first, then the next request."""
         if asker not in self._askers:
-            return  # it went in this same turn
+            return  # it left earlier in this turn
         if events & WRITE:
             asker.write()
         if events & READ:
@@ -184,4 +184,4 @@ class ControlSocket:
         try:
             return self._obey(_decode(line))
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            return Reply(error=f"not understood: {error}")
+            return Reply(error=f"invalid request: {error}")

@@ -1,4 +1,4 @@
-"""The loop: forward due batches, carry out commands, begin and end impairments."""
+"""The loop: forward due batches, execute commands, start and end impairments."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.process import StopFlag
 
 LOOK_S: Final = 0.02
-"""Longest wait, s: period of the look at the stop flag. The last events must still reach the
-recorder, which listens for 0.1 s after its own stop.
+"""Maximum wait before the stop flag is checked, s. The last events must still reach the recorder,
+which records for 0.1 s after its own stop.
 """
 
 
@@ -38,7 +38,7 @@ def run(
 
 
 def _patience_s(relay: Relay, impairments: ImpairmentSchedule) -> float:
-    """Return how long there is nothing to do."""
+    """Return the time until the next action, s."""
     at_ns = now_ns()
     due_ns = relay.next_ns()
     next_ns = impairments.next_due if due_ns is None else min(due_ns, impairments.next_due)

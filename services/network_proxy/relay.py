@@ -1,4 +1,4 @@
-"""Stands between the ends of links, and lets their batches through when they are due."""
+"""Relay between the ends of links, which forwards each batch when it is due."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from services.network_proxy.sockets import READ, ProxyEndpoint, SocketWatch
 from shared.config.impairment import Direction
 
 LINKS_MAX: Final = 16
-"""Connections of one pair. In a partition a process that lives dials again each second or so,
-and one that is frozen gives none of them up. One more, and the oldest that was left is parted."""
+"""Maximum connections of one pair. In a partition, a live process redials about every second, and a
+frozen one closes none. Beyond the maximum, the oldest abandoned connection is closed."""
 
 
 class _Due(NamedTuple):
-    """What waits for its time; of two for the same time, the one that came first."""
+    """A batch that waits for its release; of two for the same time, the earlier one goes first."""
 
     release_ns: int
     number: int
@@ -37,10 +37,10 @@ class Relay:
         watch: SocketWatch,
         lease_ns: int,
     ) -> None:
-        """Start to listen.
+        """Start listening.
 
-        `directions` have the impairments by name, others forward at once; after `lease_ns` Zenoh
-        gives up a silent link.
+        `directions` are the impairments by name; other directions forward at once. After
+        `lease_ns`, Zenoh gives up a silent link.
         """
         self._directions, self._watch, self._lease_ns = directions, watch, lease_ns
         self._links: dict[ProxyEndpoint, list[Connection]] = {
@@ -50,22 +50,22 @@ class Relay:
         self._looks_ns = 0
         self._count = count()
         self.stuck = 0
-        """Connections that were parted because an end took nothing any more."""
+        """Connections that were closed because an end no longer accepted anything."""
         for endpoint in endpoints:
             watch.want(endpoint.listener.socket, READ, partial(self._dialled, endpoint))
 
     @property
     def links(self) -> int:
-        """Connections that there are."""
+        """Number of open connections."""
         return sum(map(len, self._links.values()))
 
     @property
     def refused(self) -> int:
-        """Connections to a process that was not there, or beyond what can be held."""
+        """Connections to a missing process, or without a free descriptor."""
         return sum(endpoint.missing + endpoint.listener.turned_away for endpoint in self._links)
 
     def next_ns(self) -> int | None:
-        """Return when the next batch is due; None: none waits."""
+        """Return when the next batch is due, or None if none waits."""
         return self._due[0].release_ns if self._due else None
 
     def release_due(self, now_ns: int) -> None:
@@ -76,17 +76,17 @@ class Relay:
             self._settle(due.connection)
 
     def release_held(self, now_ns: int) -> None:
-        """Send on what partitions that are over have held back."""
+        """Forward what ended partitions have held back."""
         for links in list(self._links.values()):
             for connection in list(links):
                 for flow in connection.flows:
                     self._pass_on(connection, flow, flow.release(now_ns), now_ns)
 
     def part_stuck(self, now_ns: int) -> None:
-        """Part what stands still: an end that has taken nothing for a lease has left its link.
+        """Close stuck connections: an end that has accepted nothing for a lease has left its link.
 
-        Zenoh may have given it up without closing it, at both ends: each waits for room to say
-        so, and reads no more. While all this waits here, nobody else would ever end it.
+        Zenoh may have given up the link at both ends without closing it: each end waits for room to
+        say so, and no longer reads. While all this waits here, nothing else would ever end it.
         """
         if now_ns < self._looks_ns:
             return
@@ -100,7 +100,7 @@ class Relay:
                     self._settle(connection)
 
     def close(self) -> None:
-        """End every connection, and listen no more."""
+        """Close every connection, and stop listening."""
         for endpoint, links in self._links.items():
             for connection in list(links):
                 self._part(connection)
@@ -132,7 +132,7 @@ class Relay:
         self._settle(connection)
 
     def _settle(self, connection: Connection) -> None:
-        """Part it if it is over; else go on with it."""
+        """Close a connection if it is over; otherwise keep watching it."""
         if connection.over:
             self._part(connection)
         elif not connection.parted:

@@ -1,4 +1,4 @@
-"""Sockets of the network proxy: waited for, listened on, and dialled beyond."""
+"""Sockets of the network proxy: waiting, listening and dialling."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Ready: TypeAlias = Callable[[int, int], None]
 
 
 class SocketWatch:
-    """Every socket of the loop; any number of them, with any descriptors."""
+    """Watch on every socket of the loop; their number and descriptors are not limited."""
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
         self._wanted: dict[socket.socket, int] = {}
 
     def want(self, end: socket.socket, events: int, ready: Ready) -> None:
-        """Watch an open socket for `events` from now on, and no other; 0: not any more."""
+        """Watch an open socket for exactly `events` from now on; 0 ends the watch."""
         watched = self._wanted.get(end, 0)
         if events == watched:
             return
@@ -49,29 +49,29 @@ class SocketWatch:
     def wait(self, patience_s: float) -> list[tuple[Ready, int]]:
         """Wait until a socket is ready; return callbacks and readiness, none after `patience_s`.
 
-        The selector itself would round the patience up to a whole millisecond, longer than some
-        requested delays. So its epoll is waited for, as one socket.
+        The selector itself would round the time up to a whole millisecond, longer than some
+        requested delays. So `select` waits for the selector's epoll, as one socket.
         """
         if not select.select([self._selector], [], [], patience_s)[0]:
             return []
         return [(key.data, events) for key, events in self._selector.select(0)]
 
     def close(self) -> None:
-        """Watch none any more."""
+        """Stop watching."""
         self._wanted.clear()
         self._selector.close()
 
 
 class SocketListener:
-    """Listens on a UNIX socket, also when the descriptors are used up, and accepts without waiting.
+    """Listens on a UNIX socket and accepts without waiting, even without a free descriptor.
 
     The file of a killed process is removed.
     """
 
     def __init__(self, path: Path) -> None:
-        """Listen on a path; BusError if no socket can be made there."""
+        """Listen on a path; BusError if the socket cannot be created."""
         self.turned_away = 0
-        """Connections for which there was no descriptor."""
+        """Connections that were refused for lack of a descriptor."""
         self._path = path
         self.socket = socket.socket(socket.AF_UNIX)
         try:
@@ -81,14 +81,14 @@ class SocketListener:
             self.socket.listen()
         except OSError as error:
             self.socket.close()
-            text = f"{path}: {error.strerror or error}; an endpoint it may use is needed"
+            text = f"{path}: {error.strerror or error}; choose another endpoint"
             raise BusError(text) from None
         self.socket.setblocking(False)
         self._spare: int | None = None
         self._keep_spare()
 
     def accept(self) -> socket.socket | None:
-        """Return the socket of a new client, or None if there is none or it was turned away."""
+        """Return the socket of a new client, or None if no client waits or it was turned away."""
         try:
             end, _ = self.socket.accept()
         except OSError as error:
@@ -105,9 +105,9 @@ class SocketListener:
         self._give_spare()
 
     def _turn_away(self) -> None:
-        """Refuse who dials: the descriptor that is kept for this is lent to it.
+        """Refuse a client, with the descriptor that is kept for this.
 
-        Left in the queue it would be readable at once again, and the loop would never rest.
+        Left in the queue, it would make the socket readable at once, and the loop would never wait.
         """
         self.turned_away += 1
         self._give_spare()
@@ -130,11 +130,11 @@ class Address(NamedTuple):
 
     family: socket.AddressFamily
     where: Any
-    """What sockets of the family connect to: a path, or a numeric host with its port."""
+    """Address to connect to: a path, or a numeric host with its port."""
 
 
 class ProxyEndpoint:
-    """Between the two processes of a pair: one dials it, and it dials the other."""
+    """Endpoint between the two processes of a pair: one dials it, and it dials the other."""
 
     def __init__(self, pair: Pair, listener: SocketListener, beyond: Address) -> None:
         self.pair, self.listener = pair, listener
@@ -143,9 +143,9 @@ class ProxyEndpoint:
         self._beyond = beyond
 
     def link(self) -> tuple[socket.socket, socket.socket] | None:
-        """Accept who dials, and dial the other; return both ends, which do not block.
+        """Accept a client and dial the other process; return both ends, which do not block.
 
-        None: not both are there. Who dialled sees the end of its connection and tries again.
+        None unless both are there. The client then sees its connection end, and tries again.
         """
         dialling = self.listener.accept()
         if dialling is None:
@@ -175,18 +175,18 @@ class ProxyEndpoint:
 def address_of(endpoint: str) -> Address:
     """Resolve a Zenoh endpoint; BusError if it is neither UNIX socket nor TCP, or unknown.
 
-    A name lookup may block: at the start only.
+    A name lookup may block, so this is for the start only.
     """
     kind, _, rest = endpoint.partition("/")
     if kind == "unixsock-stream":
         return Address(socket.AF_UNIX, rest)
     if kind != "tcp":
-        text = "cannot be stood before; unixsock-stream/PATH or tcp/HOST:PORT can"
+        text = "the proxy cannot relay this; use unixsock-stream/PATH or tcp/HOST:PORT"
         raise BusError(f"{endpoint}: {text}")
     host, port = host_and_port(endpoint)
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
-        raise BusError(f"{endpoint}: {error}; a host that can be found is needed") from None
+        raise BusError(f"{endpoint}: {error}; use a host that can be resolved") from None
     family, _, _, _, where = found[0]
     return Address(family, where)

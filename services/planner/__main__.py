@@ -1,4 +1,4 @@
-"""Runs the planner process (`python -m services.planner`): the fleet's whole-body law."""
+"""Planner process (`python -m services.planner`), which runs the whole-body law."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument(
         "--controller",
         metavar="FILE.py[:NAME]",
-        help="a controller of your own in the place of the law (docs/own-controller.md)",
+        help="your own controller, instead of the law (docs/own-controller.md)",
     )
     arguments = parser.parse_args()
     logger = log.setup("planner")

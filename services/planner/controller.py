@@ -1,10 +1,10 @@
-"""A controller of your own: its interface, and how it is loaded from a file.
+"""Interface of a custom controller, and its loading from a file.
 
-It takes the place of the shipped law (docs/own-controller.md), and runs inside the planner: in
-lockstep, live and from the log. Everything around it stays as it is: stance, load, assist,
-engagement and trips of the planner; certificate of the local gains
-(`services.planner.watch.controller_guard`); age rule, envelope and torque limits of the joint
-services. Joints are in the order of `shared.joints`, the pose is p = [COM x y z; torso roll pitch
+A custom controller replaces the shipped law (docs/own-controller.md), and runs inside the planner:
+in lockstep, live and from the log. Everything around it stays the same: the planner's stance, load,
+assist, engagement and trips; the certificate of the local gains
+(`services.planner.watch.controller_guard`); the joint services' age rule, envelope and torque
+limits. Joints are in the order of `shared.joints`; the pose is p = [COM x y z; torso roll pitch
 yaw].
 """
 
@@ -27,7 +27,7 @@ from shared.exceptions import ConfigError
 
 
 class Action(NamedTuple):
-    """What the joint services are told: arrays (12,).
+    """Setpoints for the joint services: arrays (12,).
 
     A joint's torque is D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled; q_ref and tau_ff are
     extrapolated by the command's age. HOLD keeps q_ref, tau_ff and D, and drops tau_coupled.
@@ -36,29 +36,29 @@ class Action(NamedTuple):
     q_ref: Array
     """rad"""
     v_ref: Array
-    """rad/s; the rate of q_ref. A joint service refuses a q_ref that goes another way."""
+    """Rate of q_ref, rad/s. A joint service refuses a q_ref that does not follow it."""
     tau_ff: Array
-    """N m; what holds the body up without anybody's reaction."""
+    """N m; torque that supports the body without feedback."""
     dtau_ff: Array
     """Rate of tau_ff, N m/s."""
     tau_coupled: Array
-    """N m; all that is fed back over the body. Low-pass it: the joints flex."""
+    """N m; all feedback over the whole body. Low-pass it, because the joints flex."""
     D: Array
     """Local stiffness, N m/rad. It must stand alone; the local damping D_B is the schedule's."""
 
     @classmethod
-    def of(cls, law: LawOutput) -> Action:
-        """Return what the shipped law does at this tick."""
+    def from_law(cls, law: LawOutput) -> Action:
+        """Return the shipped law's action at this tick."""
         return cls(law.q_ref, law.v_ref, law.tau_ff, law.dtau_ff, law.tau_coupled, law.local.D)
 
 
 class Observation(NamedTuple):
-    """What a controller is given at a tick."""
+    """Input of a controller at a tick."""
 
     time_s: float
-    """Since it was last reset."""
+    """Time since the controller's last reset, s."""
     dt: float
-    """Since the last tick, s."""
+    """Time since the last tick, s."""
     q: Array
     """Joint angles (12,), rad."""
     v: Array
@@ -78,17 +78,17 @@ class Observation(NamedTuple):
     request: OperatorRequest
     """Assist and shift that the operator requests."""
     law: LawOutput
-    """What the shipped law does at this tick."""
+    """Output of the shipped law at this tick."""
 
 
 class Controller(Protocol):
-    """A controller; each planner makes its own."""
+    """Interface of a controller; each planner makes its own instance."""
 
     def reset(self, seen: Observation) -> None:
-        """Begin at a pose; called at every tick in which the planner does not lead."""
+        """Start from a pose; called at every tick in which the planner does not lead."""
 
     def step(self, seen: Observation) -> Action:
-        """Return what to do at a tick in which the planner leads. A period is 4 ms."""
+        """Return the action at a tick in which the planner leads. A period is 4 ms."""
 
 
 DEFAULT_NAME: Final = "Controller"
@@ -105,50 +105,52 @@ def split_spec(spec: str) -> tuple[Path, str]:
 
 
 def absolute(spec: str) -> str:
-    """Return a spec whose file is named as from anywhere."""
+    """Return a spec with an absolute path."""
     path, name = split_spec(spec)
     return f"{path.absolute()}:{name}"
 
 
 def controller_maker(spec: str, robot: RobotConfig) -> Callable[[], Controller]:
-    """Return what makes controllers of a file, one for each planner.
+    """Return a function that makes a file's controllers, one for each planner.
 
     Args:
-        spec: `FILE.py`, or `FILE.py:NAME`; NAME is called with the robot, and is `Controller` if it
-            is not given.
+        spec: `FILE.py` or `FILE.py:NAME`. NAME is called with the robot; the default is
+            `Controller`.
         robot: the robot.
 
     Raises:
-        ConfigError: the file cannot be read or run, or has nothing of that name, or what it makes
-            is no controller.
+        ConfigError: the file cannot be read or run, NAME is missing, or its result is not a
+            controller.
     """
     path, name = split_spec(spec)
     if not path.is_file() or _SPEC.fullmatch(spec) is None:
-        raise ConfigError(str(path), "--controller", "no such file", "FILE.py or FILE.py:NAME")
+        raise ConfigError(str(path), "--controller", "no such file", "use FILE.py or FILE.py:NAME")
     module_spec = importlib.util.spec_from_file_location(f"xrl_controller_{path.stem}", path)
     if module_spec is None or module_spec.loader is None:
-        raise ConfigError(str(path), "--controller", "is no Python file", "FILE.py or FILE.py:NAME")
+        raise ConfigError(
+            str(path), "--controller", "not a Python file", "use FILE.py or FILE.py:NAME"
+        )
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[module_spec.name] = module
     sys.path.append(str(path.absolute().parent))  # for files beside it
     make = _checked(path, "it", lambda: _executed(module_spec, module, name))
     if make is None:
-        right = f"a class or function {name}(robot)"
+        right = f"define a class or function {name}(robot)"
         raise ConfigError(str(path), "--controller", f"has no {name}", right)
     made = _checked(path, f"{name}(robot)", lambda: make(robot))
     missing = [part for part in ("reset", "step") if not callable(getattr(made, part, None))]
     if missing:
-        right = "reset(seen) and step(seen), as services/planner/controller.py has them"
+        right = "define reset(seen) and step(seen), as in services/planner/controller.py"
         raise ConfigError(str(path), name, f"has no {' and no '.join(missing)}", right)
     first = [made]
-    # one that was made to look at it is the first planner's: it may have opened a device
+    # the first planner gets the instance made for the check, which may have opened a device
     return lambda: first.pop() if first else _checked(path, f"{name}(robot)", lambda: make(robot))
 
 
 def _executed(
     spec: importlib.machinery.ModuleSpec, module: object, name: str
 ) -> Callable[[RobotConfig], Controller] | None:
-    assert spec.loader is not None  # noqa: S101 - looked at before
+    assert spec.loader is not None  # noqa: S101 - checked by the caller
     spec.loader.exec_module(module)  # type: ignore[arg-type]  # it is a module
     return getattr(module, name, None)
 
@@ -158,4 +160,6 @@ def _checked(path: Path, what: str, run: Callable[[], T]) -> T:
         return run()
     except Exception as error:
         found = f"{what} raised {type(error).__name__}: {error}"
-        raise ConfigError(str(path), "--controller", found, "see its line in Python") from error
+        raise ConfigError(
+            str(path), "--controller", found, "import it in Python to see the line"
+        ) from error

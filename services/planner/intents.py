@@ -1,10 +1,10 @@
-"""Keeps the operator's newest intent (`operator/intent`) and fades it out once stale. Pure.
+"""The operator's newest intent (`operator/intent`), which fades out once stale. Pure.
 
 An intent that is not repeated goes stale: an operator who requested 100 N and left must not be
 lifted forever. It fades out slowly, because somebody may still lean on the robot:
 
     request = intent                                       younger than `assist.stale_ms`
-    request = intent max(0, 1 - (age - stale) / fade)      older; sinking ends then
+    request = intent max(0, 1 - (age - stale) / fade)      older; lowering stops at once
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ class OperatorRequest(NamedTuple):
     shift: Vector4 = STRAIGHT
     """x, y in m; roll, yaw in rad."""
     source: str = ""
-    """Name of the requester; "" if nobody requests anything, or the intent is stale."""
+    """Name of the requester; "" without a request, or if the intent is stale."""
     sit: bool = False
-    """Go down by itself to the lowest pose (`services.planner.law.closed_reference`)."""
+    """Lower the robot to its lowest pose (`services.planner.law.closed_reference`)."""
     park: int = Park.AUTO
-    """What is asked of a robot that may park (`services.planner.watch.park`)."""
+    """Request to a robot that may park (`services.planner.watch.park`)."""
 
 
 class Intents:
-    """Keeps the newest intent, and fades it out once it is stale."""
+    """Newest intent, which fades out once it is stale."""
 
     def __init__(self, config: AssistConfig) -> None:
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
@@ -41,7 +41,7 @@ class Intents:
         self._received_ns = 0
 
     def receive(self, intent: OperatorIntent, now_ns: int) -> None:
-        """Store an intent that has arrived; ignore one with a value that cannot be."""
+        """Store an intent that has arrived; ignore one with a value that is not finite."""
         if all(map(math.isfinite, (intent.assist_n, *intent.shift))):
             self._request = OperatorRequest(
                 intent.assist_n, intent.shift, intent.source, intent.sit, intent.park
@@ -49,7 +49,7 @@ class Intents:
             self._received_ns = now_ns
 
     def request(self, now_ns: int) -> OperatorRequest:
-        """Return the assist and shift that are requested now."""
+        """Return the request that is valid now."""
         late_ns = now_ns - self._received_ns - self._stale_ns
         if late_ns <= 0:
             return self._request

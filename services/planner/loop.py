@@ -1,6 +1,6 @@
-"""Runs the planner's loop: read six states, compute, publish six commands and a status.
+"""The planner's loop: read six states, compute, publish six commands and a status.
 
-Live, lockstep and re-execution run this loop over ports and a clock of their own.
+Live, lockstep and re-execution run this loop, each with its own ports and clock.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from shared.process import StopFlag
 
 
 class PlannerPorts(msgspec.Struct, frozen=True):
-    """What the planner takes and sends; one of each sequence for a module, in `MODULES` order."""
+    """Inputs and outputs of the planner; sequences have one entry per module, as in `MODULES`."""
 
     states: Sequence[Inbox[JointState]]
     wrench: Inbox[Wrench]
     attitude: Inbox[Attitude]
     request: Callable[[int], OperatorRequest]
-    """Returns what the operator requests at a time of the planner's clock."""
+    """Returns the operator's request at a time of the planner's clock, ns."""
     commands: Sequence[Outbox[JointCommand]]
     status: Outbox[PlannerStatus]
     checkpoint: Outbox[PlannerCheckpoint] | None
-    """None: nothing is recorded for re-execution."""
+    """None if nothing is recorded for re-execution."""
     announce: Callable[[int], None] | None = None
-    """Takes the planner's session, so that joint services on its host see its process end."""
+    """Announces the planner's session, so that joint services on its host detect its end."""
 
 
 def requests_of(
     config: RobotConfig, intents: Inbox[OperatorIntent]
 ) -> Callable[[int], OperatorRequest]:
-    """Return what the operator requests, by the intents that come."""
+    """Return a function that returns the operator's request, from the received intents."""
     kept = Intents(config.assist)
 
     def request(now_ns: int) -> OperatorRequest:
@@ -59,10 +59,10 @@ def requests_of(
 
 
 class _Checkpoints:
-    """Says when the planner's state is recorded, so that re-execution can start from it.
+    """Schedule of the recorded planner states, from which re-execution can start.
 
-    After every tick whose number is a power of two, then once a second. It is frequent at first,
-    because a recorder discovers a new planner with a short delay.
+    Due after every tick whose number is a power of two, then once a second. The first ones are
+    frequent, because a recorder discovers a new planner with a short delay.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -72,7 +72,7 @@ class _Checkpoints:
         self._encode = msgspec.json.Encoder().encode
 
     def after(self, planner: Planner, now_ns: int) -> PlannerCheckpoint | None:
-        """Return the state after the tick just run, if it is due."""
+        """Return the state after the tick just run, or None if it is not due."""
         self._tick += 1
         tick = self._tick
         first = tick < self._every and tick & (tick - 1) == 0
@@ -88,19 +88,19 @@ class _Checkpoints:
 
 
 POLL_NS = 200 * NS_PER_US
-"""ns between two looks for states that are not all there when they were expected."""
+"""Poll period while expected states are missing, ns."""
 FOLLOW_NS = 20 * NS_PER_US
-"""Maximum ns by which one late tick moves the time at which the next states are expected: a tick
-that was held up makes none of the following late."""
+"""ns; maximum delay that one late tick adds to the expected time of the next states, so that a tick
+that was held up does not delay the following ones."""
 EARLIER_NS, EARLIER_MAX_NS = 40 * NS_PER_US, 400 * NS_PER_US
-"""ns by which states are expected earlier after a tick that found them at its first look: they may
-have been there for a while. It doubles with each such tick in a row, up to the maximum. With these
-two the last state waits 0.12 ms in the mean if the arrivals spread over 0.5 ms, for 1.9 looks a
-tick, and 0.18 ms if they spread over 2 ms."""
+"""ns; initial and maximum advance of the expected time after a tick that found all states at its
+first look, because they may have arrived earlier. The advance doubles with each such tick in a row.
+With these values the last state waits 0.12 ms on average if the arrivals spread over 0.5 ms, at 1.9
+looks per tick, and 0.18 ms if they spread over 2 ms."""
 
 
 class PlannerLoop:
-    """Ticks the planner when its six states have arrived, at their rate."""
+    """Loop that ticks the planner when its six states have arrived, at their rate."""
 
     def __init__(
         self,
@@ -129,11 +129,11 @@ class PlannerLoop:
             sleep_until(self._next_look(now, ticked=due))
 
     def _next_look(self, now: int, *, ticked: bool) -> int:
-        """Return when to look for states again, ns, after a look `now`.
+        """Return the time of the next look for states, ns, after a look at `now`.
 
-        Each look wakes the process with cold caches, so it looks once in a period, when the last
-        state is expected, and then every `POLL_NS`. The expected time follows the arrivals: from a
-        whole period too late it is back within 15 ticks.
+        Each look wakes the process with cold caches, so the loop looks once per period, when the
+        last state is expected, and then every `POLL_NS`. The expected time follows the arrivals:
+        it recovers from an error of a whole period within 15 ticks.
         """
         if not ticked:
             self._earlier_ns = 0
@@ -182,6 +182,6 @@ class PlannerLoop:
                 ports.checkpoint.put(checkpoint)
 
     def _report(self) -> None:
-        """Log that it yields to another planner, or goes on; it leads nobody then."""
+        """Log that the planner yields or resumes; it leads in neither state, so logging is safe."""
         self._yielded = self.planner.yields
-        log.get("xrl").warning("%s", self.planner.rival or "no other planner leads: going on")
+        log.get("xrl").warning("%s", self.planner.rival or "no other planner leads: resuming")

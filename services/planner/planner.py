@@ -1,4 +1,4 @@
-"""Runs planner ticks without I/O: six states in, six commands and a status out.
+"""Planner ticks without I/O: six states in, six commands and a status out.
 
 The same object runs live behind the bus, in lockstep under virtual time, and in re-execution from a
 log.
@@ -51,7 +51,7 @@ EARLY_FRACTION = 0.5
 LATE_FRACTION = 1.25
 """Fraction of a period after which the planner ticks with the states it has."""
 TICK_GAP_MAX_S = 0.02
-"""A longer gap between ticks (a stopped process) is not integrated over."""
+"""Maximum integration step, s; a longer gap between ticks means a stopped process."""
 
 _ALL_NEW = (1 << N_MODULES) - 1
 # Compared in each tick: docs/contributing.md, The control path.
@@ -60,19 +60,19 @@ _WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
 
 
 class PlannerState(msgspec.Struct, kw_only=True):
-    """All that changes in `Planner` from tick to tick; lists have one entry for each module."""
+    """Everything in `Planner` that changes between ticks; lists have one entry per module."""
 
     states: list[JointState | None] = msgspec.field(default_factory=lambda: [None] * N_MODULES)
     arrived_ns: list[int] = msgspec.field(default_factory=lambda: [0] * N_MODULES)
     new: int = 0
-    """Bit i: module i has a state that no tick has used."""
+    """Bit i: module i has a state that no tick has used yet."""
     wrench: Wrench | None = None
     wrench_ns: int = 0
     attitude: Attitude | None = None
     attitude_ns: int = 0
     request: OperatorRequest = OperatorRequest()
     refused: int = 0
-    """Implausible measurements so far."""
+    """Number of implausible measurements so far."""
     last_ns: int = 0
     """Time of the last tick."""
     seq: int = 0
@@ -90,12 +90,12 @@ class PlannerState(msgspec.Struct, kw_only=True):
     supply: SupplyState = msgspec.field(default_factory=SupplyState)
     law: LawState = msgspec.field(default_factory=LawState)
     guard: GuardState = msgspec.field(default_factory=GuardState)
-    """Changes only if a controller of your own runs."""
+    """Changes only if a custom controller runs."""
     unattended: Unattended = msgspec.field(default_factory=Unattended)
     trips: TripsState = msgspec.field(default_factory=TripsState)
     fall: FallState = msgspec.field(default_factory=FallState)
     park: ParkState = msgspec.field(default_factory=ParkState)
-    """Changes only where the robot may park."""
+    """Changes only if the robot may park."""
 
 
 class Inputs(NamedTuple):
@@ -105,9 +105,9 @@ class Inputs(NamedTuple):
     dt: float
     """Time since the last tick, s."""
     states: list[JointState]
-    """Newest of each module, of any age."""
+    """Newest state of each module, of any age."""
     fresh: list[bool]
-    """True if a module's state has come within `planner.state_stale_ms`."""
+    """True if a module's state arrived within `planner.state_stale_ms`."""
     q: Array
     """(12,), rad"""
     v: Array
@@ -115,16 +115,16 @@ class Inputs(NamedTuple):
     tau: Array
     """(12,), N m"""
     wrench: Wrench | None
-    """Newest of the harness; None if it is invalid or too old."""
+    """Newest wrench of the harness; None if invalid or stale."""
     up: Vector3 | None
-    """Unit vector against gravity, torso axes; None if it is invalid or too old."""
+    """Unit vector against gravity, torso axes; None if invalid or stale."""
     turning: Vector3 | None
-    """Angular velocity of the torso by the IMU, rad/s, torso axes; None with `up`."""
+    """Angular velocity of the torso from the IMU, rad/s, torso axes; None if `up` is None."""
     request: OperatorRequest
 
 
 class _Ages(NamedTuple):
-    """Largest ages of what is used, ns."""
+    """Maximum ages of inputs and commands, ns."""
 
     state: int
     wrench: int
@@ -136,10 +136,10 @@ class Planner:
     """Whole-body law behind its engagement rule.
 
     Attributes:
-        session: drawn at random at each start; sent in every command.
-        state: all that changes from tick to tick. A snapshot is a copy of it
+        session: number drawn at random at each start; sent in every command.
+        state: everything that changes between ticks. A snapshot is a copy of it
             (`shared.state.copied`), and another planner that gets the copy continues bit for bit.
-            A controller of your own keeps its state itself.
+            A custom controller keeps its own state.
     """
 
     def __init__(
@@ -149,8 +149,8 @@ class Planner:
 
         Args:
             config: the robot.
-            session: drawn at random.
-            controller: in the place of the shipped law.
+            session: number drawn at random.
+            controller: replaces the shipped law.
         """
         self.session = session
         self.state = PlannerState()
@@ -183,7 +183,7 @@ class Planner:
 
     @property
     def compares_arrivals(self) -> bool:
-        """True if the next states' arrivals count (`services.planner.state_phases`)."""
+        """True if arrivals of the next states are compared (`services.planner.state_phases`)."""
         return self._phases.compares(self.state.phases)
 
     def receive_state(self, module: int, state: JointState, now_ns: int) -> None:
@@ -220,8 +220,8 @@ class Planner:
         """Return True if a tick is due: as soon as all six modules have a new state.
 
         Low age matters, because in the open directions only fresh references cancel the local
-        gains. On its own timer the planner would let states age for up to a period. Waiting for
-        them, it ticks at their rate, and it waits only briefly for late ones.
+        gains. With its own timer, the planner would let states age by up to a period. It therefore
+        waits for the states and ticks at their rate, but waits only briefly for late ones.
         """
         since_s = (now_ns - self.state.last_ns) / NS_PER_S
         if self.state.new == _ALL_NEW:
@@ -231,8 +231,8 @@ class Planner:
     def tick(self, now_ns: int) -> list[JointCommand]:
         """Run the law; return six commands.
 
-        None until every module has sent a state. While another planner leads none that a module
-        would accept, and those rarely.
+        The list is empty until every module has sent a state. While another planner leads, it is
+        empty or an announcement, which every module refuses.
 
         Args:
             now_ns: the planner's monotonic clock.
@@ -257,7 +257,7 @@ class Planner:
         return self._announcement(inputs, output)
 
     def _inputs(self, now_ns: int) -> Inputs | None:
-        """Return what a tick now uses; None until every module has sent a state."""
+        """Return the inputs of a tick; None until every module has sent a state."""
         s, ages = self.state, self._ages
         states = [state for state in s.states if state is not None]
         if len(states) < N_MODULES:
@@ -300,7 +300,7 @@ class Planner:
         self._phases.advance(s.phases, states, s.arrived_ns, last_ns)
 
     def _run_law(self, inputs: Inputs, assist_requested: float) -> LawOutput:
-        """Return the output of the law, or of a controller of your own in its place."""
+        """Return the output of the law, or of a custom controller in its place."""
         s, dt = self.state, inputs.dt
         if self._park.enabled:
             parked = s.trust.scale * self._parked_assist(inputs)
@@ -320,7 +320,7 @@ class Planner:
                 toward=self._toward(heat.toward),
                 released=(height or s.park.closed, pitch or s.park.closed),
                 pitch_drive=s.unattended.pitch.drive,
-                # until all engage, the law restarts from the measured pose: there is no step
+                # until all engage, the law restarts from the measured pose, so nothing steps
                 align=s.engagement.hold,
                 wrench=inputs.wrench,
                 up_torso=inputs.up,
@@ -407,7 +407,7 @@ class Planner:
                 s.law.load, s.law.has_led, s.trust = LoadState(), False, HarnessTrust()
 
     def _announcement(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
-        """Return now and then commands that answer no state: too old, whatever the network does."""
+        """Return, at times, commands that every module refuses because their echo is too old."""
         if not self.state.rival.announces(inputs.now_ns):
             return []
         earlier_ns = 2 * self._ages.command
@@ -418,7 +418,7 @@ class Planner:
 
     @property
     def yields(self) -> bool:
-        """True while another planner leads, and this one waits."""
+        """True while another planner leads and this one waits."""
         return self.state.rival.yields
 
     @property
@@ -460,16 +460,16 @@ class Planner:
         ]
 
     def _toward(self, heat: Toward) -> Toward:
-        """Return where the robot goes by itself; what is too warm goes first."""
+        """Return where the robot moves on its own; heat takes precedence."""
         return Toward.DOWN if heat is Toward.PERSON and self._sits else heat
 
     @property
     def _sits(self) -> bool:
-        """True while the robot is to go down by itself."""
+        """True while the robot lowers itself, on request or for a low supply."""
         return self.state.request.sit or self.state.supply.sits
 
     def _inhibit(self) -> PlannerMode | None:
-        """Return why the planner may not engage, from the last tick's results; None if it may."""
+        """Return the mode that prevents engaging, from the last tick's results; None if allowed."""
         s = self.state
         if s.rival.yields:
             return PlannerMode.YIELDING
@@ -490,12 +490,12 @@ class Planner:
     def _hold(self) -> bool:
         """Return True if commands carry `hold`.
 
-        It uses this tick's results: without a certificate no gains go to modules in TRACK.
+        It uses this tick's results, so no uncertified gains reach modules in TRACK.
         """
         return self.state.engagement.hold or self._inhibit() is not None
 
     def _why(self) -> str:
-        """Return what the person must know: of the supply, of heat, and why it does not lead."""
+        """Return messages for the wearer: supply, harness, heat, and why the planner holds."""
         s = self.state
         refusal = (
             s.rival.describe()
@@ -559,7 +559,7 @@ class Planner:
             heat=int(s.heat.action),
             heat_left_s=s.heat.left_s,
             supply_v=s.supply.volts,
-            wearer=int(s.park.shown(now_ns)) if self._park.enabled else 0,
+            wearer=int(s.park.reported(now_ns)) if self._park.enabled else 0,
             park_requested=int(s.request.park),
             carried_n=GRAVITY * (self._payload + load.kg) - (s.heat.lifted or 0.0),
         )

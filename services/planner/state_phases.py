@@ -1,14 +1,14 @@
-"""Chooses in which periods each module sends its state, so that the six come together. Pure.
+"""Choice of the periods in which modules send their states, so that all six arrive together. Pure.
 
-A module sends its state every nth period of its drive (n = 2: 500 Hz and 250 Hz). No clock ties the
-drives together, and the modules begin to count at different times. If one sends in its even periods
-what the others send in their odd ones, each tick waits for it, and uses five states that are a
-period older than they need be. The planner compares the states' arrivals with the first module's,
-and names in each command the period in which the next state is to be sent
-(`JointCommand.state_phase`). A late command, or none, changes nothing: a module keeps its phase.
+A module sends its state every nth period of its drive (n = 2: 500 Hz and 250 Hz). The drives share
+no clock, and the modules start counting at different times. If one module sends in its even periods
+and the others in their odd ones, each tick waits for it and uses five states that are a period
+older than necessary. The planner compares the states' arrivals with the first module's. Each
+command names the period in which the module sends its next state (`JointCommand.state_phase`).
+Without a command in time, a module keeps its phase.
 
-Arrivals are compared in the first ticks of each `EVERY_TICKS`. Only then does the planner's loop
-look for states all the time; otherwise it rests until they are due, and what came early looks late.
+The planner compares arrivals in the first ticks of each `EVERY_TICKS`. Only then does its loop poll
+continuously; otherwise it sleeps until states are due, so an early state would look late.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from shared.clock import NS_PER_S
 from shared.joints import N_MODULES
 
 EVERY_TICKS: Final = 1024
-"""Largest number of ticks between two comparisons: 4 s, in which two drives' clocks drift apart by
+"""Maximum number of ticks between two comparisons: 4 s, in which two drives' clocks drift apart by
 at most a fifth of a period (100 ppm)."""
 COMPARED_TICKS: Final = 64
 """Ticks of a comparison: a quarter of a second, so that no single late message moves a module."""
 SOON_TICKS: Final = 256
 """Ticks until the next comparison after a module moved or was silent: a second."""
 SURE: Final = 0.5
-"""Length of a mean direction from which it counts, 0 .. 1; an even spread over all phases has 0."""
+"""Minimum length of a mean direction, 0 .. 1; an even spread over all phases has length 0."""
 HYSTERESIS: Final = 0.15
 """Fraction of a period beyond half a period at which a module moves. The drives' clocks drift past
-one another; without it a phase would change back and forth at the boundary."""
+one another; without this margin a phase would change back and forth at the boundary."""
 
 
 class PhasesState(msgspec.Struct):
     """State of `StatePhases`."""
 
     phases: list[int] = []
-    """Each module sends its state in periods of this number modulo n; empty before the first."""
+    """Period number modulo n in which each module sends its state; empty before the first tick."""
     tick: int = 0
-    """Ticks since the last comparison began."""
+    """Ticks since the last comparison started."""
     every: int = SOON_TICKS
-    """Ticks from its begin to that of the next."""
+    """Ticks from the start of one comparison to the next."""
     sums: list[Pair] = msgspec.field(default_factory=lambda: [(0.0, 0.0)] * N_MODULES)
     """Sum of (cos, sin) of 2 pi d / n for each module, whose states arrive d periods behind the
     first module's."""
@@ -59,7 +59,7 @@ class StatePhases:
         self._radians_per_ns = 2.0 * math.pi * state_rate_hz / NS_PER_S
 
     def compares(self, state: PhasesState) -> bool:
-        """Return True if the next tick's arrivals are compared: no rest may round them up."""
+        """Return True if the next tick's arrivals are compared, so the loop must not sleep."""
         return self._n > 1 and bool(state.phases) and state.tick < COMPARED_TICKS
 
     def advance(
@@ -72,15 +72,15 @@ class StatePhases:
         """Compare the states of a tick, if all six are new.
 
         Args:
-            state: of the phases, which changes.
-            states: of the six modules.
-            arrived_ns: their arrivals, by the planner's clock.
-            last_tick_ns: time of the tick before.
+            state: state of the phases; updated in place.
+            states: newest states of the six modules.
+            arrived_ns: their arrival times on the planner's clock.
+            last_tick_ns: time of the previous tick.
         """
         n, first_ns = self._n, arrived_ns[0]
-        if not state.phases:  # as the last planner left them
+        if not state.phases:  # start from the last planner's phases
             state.phases = [one.state_phase % n for one in states]
-        compares = self.compares(state) and state.tick > 0  # before the first there was a rest
+        compares = self.compares(state) and state.tick > 0  # the loop slept before the first
         state.tick = (state.tick + 1) % state.every
         if not compares:
             return
@@ -97,7 +97,7 @@ class StatePhases:
         settled = True
         for module, (state, (x, y)) in enumerate(zip(states, own.sums, strict=True)):
             behind = n / (2.0 * math.pi) * math.atan2(y, x)
-            # one that is in another phase than it was told has not heard yet
+            # a module in another phase has not received its new phase yet
             told = state.state_phase % n == own.phases[module]
             sure = math.hypot(x, y) > SURE * count
             settled &= sure

@@ -1,1 +1,1 @@
-"""The recorder: everything on the bus into MCAP files (docs/logs.md)."""
+"""Recorder: writes everything on the bus to MCAP files (docs/logs.md)."""

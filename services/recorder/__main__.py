@@ -1,12 +1,12 @@
 """Recorder: `python -m services.recorder --out DIR` writes DIR/run.mcap until stopped.
 
-A new run never replaces a file: it is then run-1.mcap, run-2.mcap, ... A long run is split into
-run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says. Unfinished files of earlier
-recorders in DIR are recovered meanwhile. SIGTERM and SIGINT finish the file; after SIGKILL the next
-recorder, or `xrl log recover`, recovers what was flushed.
+A new run never replaces a file: it is then called run-1.mcap, run-2.mcap, ... A long run is split
+into run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says. Meanwhile, unfinished files
+of earlier recorders in DIR are recovered. SIGTERM and SIGINT finish the file; after SIGKILL the
+next recorder, or `xrl log recover`, recovers what was flushed.
 
-With --of it is one host's own recorder: it dials these services only, and records what they say
-though the network to the fleet's recorder is cut.
+With --of it is one host's own recorder: it dials only these services, and records them even if the
+network to the fleet's recorder is cut.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ DRAIN_PERIOD_S: Final = 0.02
 """Bounds how late `log_time` is, beside the 20 ms of a batch. 5, 10 and 20 ms cost the same CPU."""
 
 LAST_WORDS_S: Final = 0.1
-"""After a stop, for what other stopping services still have to say."""
+"""Time after a stop in which last messages of other stopping services are recorded, s."""
 
 
 def main() -> int:
     """Run the recorder; return the exit code."""
-    os.umask(0o027)  # a record may be read by the group, and is nobody's to change
+    os.umask(0o027)  # the group may read a record, but not change it
     stop = StopFlag()
     logger = log.setup("recorder")
     arguments = _arguments()
@@ -55,7 +55,7 @@ def main() -> int:
     metadata = _metadata(config.name, arguments, config.recorder)
     recorded = _recorded(config.name, arguments.of)
     granted = scheduling.apply("recorder")
-    # The bus before the file: an endpoint that is taken leaves no empty file behind.
+    # The bus before the file: if the endpoint is in use, no empty file is left behind.
     name = topics.HOST_RECORDER if arguments.of else topics.RECORDER
     with open_session(config, name, arguments.run_dir, only=arguments.of) as session:
         stream = session.recording()
@@ -88,12 +88,12 @@ def main() -> int:
 
 
 def _tell_end(writer: RunWriter, recording: Recorder, counts: str, logger: logging.Logger) -> int:
-    """Say what was recorded; return the exit code: 2 if a file of it is not there."""
+    """Log what was recorded; return the exit code, 2 if one of its files was removed."""
     what = f"finished {writer.path}" if writer.path.exists() else "nothing written"
     logger.info("%s: %s", what, counts)
     if recording.removed_files:
         logger.error(
-            "%d of %d files were removed while they were written, with %d of the messages",
+            "%d of %d files were removed while being written, with %d of the messages",
             recording.removed_files, writer.begun, recording.removed_messages,
         )  # fmt: skip
         return RunError.exit_code
@@ -118,7 +118,7 @@ def _record(
     roster: Roster | None,
     host: RunDirWatch,
 ) -> None:
-    """Record until `stop`, then the queued rest."""
+    """Record until `stop`, then write the queued rest."""
     while not stop:
         now = now_ns()
         if roster is not None:
@@ -134,7 +134,7 @@ def _record(
 def _about(writer: RunWriter, keys: int) -> str:
     if not writer.recording:
         return f"waiting for space to record {keys} keys"
-    beside = "" if writer.path.name == FIRST else f" ({FIRST} is there already and stays)"
+    beside = "" if writer.path.name == FIRST else f" ({FIRST} exists already and is kept)"
     return f"recording {keys} keys to {writer.path}{beside}"
 
 
@@ -147,10 +147,10 @@ def _arguments() -> argparse.Namespace:
         "--of",
         type=_services,
         metavar="SERVICE,...",
-        help="record these services of this host only, beside the fleet's recorder on another",
+        help="record only these services of this host; the fleet's recorder runs on another host",
     )
     parser.add_argument("--scenario", type=Path, help="scenario file, attached as scenario.toml")
-    parser.add_argument("--scenario-text", default="", help="what this run is, in words")
+    parser.add_argument("--scenario-text", default="", help="description of this run")
     parser.add_argument(
         "--attach",
         action="append",
@@ -165,8 +165,8 @@ def _services(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(","))
     for name in names:
         if name not in SERVICES:
-            right = f"one of {', '.join(SERVICES)}"
-            raise argparse.ArgumentTypeError(f"no service {name!r}; {right}")
+            right = f"use one of {', '.join(SERVICES)}"
+            raise argparse.ArgumentTypeError(f"unknown service {name!r}; {right}")
     return names
 
 
@@ -182,7 +182,7 @@ def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
     for text in arguments.attach:
         name, equals, file = text.partition("=")
         if not (name and equals and file) or name in files:
-            raise ConfigError("--attach", "NAME=FILE", repr(text), "a new name, = and a file")
+            raise ConfigError("--attach", "NAME=FILE", repr(text), "give a new name, = and a file")
         files[name] = Path(file)
     contents = {}
     for name, path in files.items():
@@ -191,7 +191,7 @@ def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
         except OSError as error:
             found = f"cannot be read: {error.strerror}"
             raise ConfigError(
-                str(path), "(file)", found, f"it is to be attached as {name}"
+                str(path), "(file)", found, f"it must be readable, to be attached as {name}"
             ) from None
     return contents
 

@@ -1,7 +1,7 @@
 """Recovers unfinished files of earlier recorders while this one records.
 
-It is a thread, because recording must not wait: a file of an hour takes a minute. It leaves half of
-its time to the recorder's loop.
+It runs in a thread, because recording must not wait: a file of one hour takes a minute. It leaves
+half of its time to the recorder's loop.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from shared.mcap_log.recover import Interrupted
 
 
 class AutoRecovery(threading.Thread):
-    """Looks through a directory once, and ends; leaves `keep_free` bytes free beside a copy."""
+    """Scans a directory once, then ends; leaves `keep_free` bytes free beside a copy."""
 
     def __init__(self, directory: Path, keep_free: int, logger: logging.Logger) -> None:
         super().__init__(name="auto_recovery", daemon=True)
@@ -29,7 +29,7 @@ class AutoRecovery(threading.Thread):
         self._resumed = time.monotonic()
 
     def halt(self) -> None:
-        """Stop, and wait until that is done: an unfinished copy goes, the original stays."""
+        """Stop, and wait until that is done; an unfinished copy is deleted, the original stays."""
         self._halt.set()
         if self.is_alive():
             self.join()
@@ -44,13 +44,13 @@ class AutoRecovery(threading.Thread):
             try:
                 recover_in_place(path, self._keep_free, self._logger, self._pace)
             except Interrupted:
-                self._logger.info("%s: recovery goes on at the next start", path)
+                self._logger.info("%s: recovery continues at the next start", path)
                 return
             except (RunError, OSError) as error:
-                self._logger.warning("left as it is: %s", error)
+                self._logger.warning("not recovered: %s", error)
 
     def _pace(self) -> bool:
-        """Rest for as long as the last piece took; return True if it is time to stop."""
+        """Sleep for as long as the last piece took; return True if it is time to stop."""
         stopped = self._halt.wait(time.monotonic() - self._resumed)
         self._resumed = time.monotonic()
         return stopped
@@ -59,12 +59,12 @@ class AutoRecovery(threading.Thread):
 def recover_in_place(
     path: Path, keep_free: int, logger: logging.Logger, stop: recover.Stop
 ) -> None:
-    """Recover one file, if it is unfinished and nobody writes it.
+    """Recover one file, if it is unfinished and no process writes it.
 
-    A file that was only cut off is replaced by its recovered copy once that is on the disk. If
-    there is damage in the middle as well, the original stays and the copy goes beside it. Raises
-    RunError or OSError if the file cannot be read or the copy not written; Interrupted if `stop`
-    returned True.
+    A file that was only cut off is replaced by its recovered copy once the copy is on the disk. If
+    there is damage in the middle as well, the original stays and the copy is put beside it. Raises
+    RunError or OSError if the file cannot be read or the copy cannot be written; Interrupted if
+    `stop` returned True.
     """
     beside = recovered_name(path)
     with locked(path) as free:
@@ -72,7 +72,7 @@ def recover_in_place(
             return
         size = path.stat().st_size
         if shutil.disk_usage(path.parent).free < size + keep_free:
-            logger.warning("%s was not finished; there is no space to recover it", path)
+            logger.warning("%s was not finished; there is not enough space to recover it", path)
             return
         outcome = recover.recover(path, beside, stop)
         if not outcome.damage and not outcome.orphans:

@@ -1,9 +1,9 @@
 """Watches the recorder's host: free disk space, and which tools are linked.
 
-No other service has the time to look for it. When the disk is too full to go on recording,
-nothing is ever deleted: below the least free space the file is finished while there is still room
-for its end, and recording waits. Once there is clearly more again it goes on with the run's next
-file. A run that is stopped here does not end the recorder.
+No other service has the time for this. When the disk is too full to keep recording, nothing is ever
+deleted. Below the minimum free space, the file is finished while there is still room for its end,
+and recording pauses. Once there is clearly more space, it continues with the run's next file. A run
+that is stopped here does not end the recorder.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from shared.clock import NS_PER_MS, NS_PER_S
 MIB: Final = 1 << 20
 
 WARN: Final = 2.0
-"""Multiple of the least free space below which it warns."""
+"""Multiple of the minimum free space below which it warns."""
 RESUME: Final = 1.5
-"""Multiple of the least free space above which recording resumes."""
+"""Multiple of the minimum free space above which recording resumes."""
 CALM: Final = 2.5
-"""Multiple of the least free space above which the next warning is new."""
+"""Multiple of the minimum free space above which the next shortage warns again."""
 RUN_DIR_MIN_MIB: Final = 16
-"""Free space below which the run directory is called full: its logs lose lines soon."""
+"""Free space below which the run directory counts as full, MiB: its logs soon lose lines."""
 _EVERY_NS: Final = 2 * NS_PER_S
 
 
 class DiskChange(Enum):
-    """Change at the newest look at the disk."""
+    """Change at the newest check of the disk."""
 
     NONE = 0
     LOW = 1
@@ -42,16 +42,16 @@ class DiskChange(Enum):
 
 
 class SpaceGuard:
-    """Feed it the free space once in a while; a least free space of 0 switches it off."""
+    """Judges the free space that it is fed periodically; a minimum of 0 switches it off."""
 
     def __init__(self, least_mib: float) -> None:
         self.enough = True
-        """Recording may go on."""
+        """True while recording may continue."""
         self._least = least_mib * MIB
         self._warned = False
 
     def feed(self, free_bytes: int) -> DiskChange:
-        """Take the free space; return what changes by it."""
+        """Update with the free space; return the change."""
         if not self._least:
             return DiskChange.NONE
         if self.enough and free_bytes < self._least:
@@ -71,7 +71,7 @@ class SpaceGuard:
 
 
 def free_bytes_at(directory: Path) -> int:
-    """Return the free space where a directory is or will be; OSError if it cannot be read."""
+    """Return the free space where a directory is or will be, bytes; OSError if it is unreadable."""
     while not directory.exists() and directory != directory.parent:
         directory = directory.parent
     found = os.statvfs(directory)
@@ -79,14 +79,14 @@ def free_bytes_at(directory: Path) -> int:
 
 
 class Deadline:
-    """True once per period."""
+    """Deadline that passes once per period."""
 
     def __init__(self, period_ns: int, now: int) -> None:
         self._period_ns = period_ns
         self._due_ns = now + period_ns
 
     def passed(self, now: int) -> bool:
-        """Return True, and begin the next period, if this one is over."""
+        """Return True, and start the next period, if this one is over."""
         if now < self._due_ns:
             return False
         self._due_ns = now + self._period_ns
@@ -101,10 +101,10 @@ class RunDirWatch:
         self._guard = SpaceGuard(RUN_DIR_MIN_MIB)
         self._due = Deadline(_EVERY_NS, now_ns)
         self.trouble = ""
-        """What is wrong with the run directory's disk, in words; empty if nothing is."""
+        """Problem of the run directory's disk; empty without one."""
 
     def check_if_due(self, now_ns: int) -> None:
-        """Check if it is due, and warn of what is found."""
+        """Check the disk if that is due, and log a warning if it is low."""
         if not self._due.passed(now_ns):
             return
         try:
@@ -120,13 +120,13 @@ class RunDirWatch:
 
 
 NEWS_NS: Final = 100 * NS_PER_MS
-"""Between two messages, however many tools come and go."""
+"""Minimum time between two messages, ns, however many tools connect or leave."""
 
 
 class Roster:
-    """Sends twice a second, and at each change, who is linked and why nothing is recorded.
+    """Publishes twice a second, and at each change, the linked tools and why nothing is recorded.
 
-    For `xrl status` and the log. Every tool dials the recorder, so it knows all that are linked.
+    For `xrl status` and the log. Every tool dials the recorder, so the recorder knows them all.
     """
 
     def __init__(self, session: Session) -> None:
@@ -137,7 +137,7 @@ class Roster:
         self._seq = 0
 
     def put_if_due(self, now_ns: int, trouble: tuple[str, ...]) -> None:
-        """Send who is linked and what is wrong, if that is news or due again; never blocks."""
+        """Publish linked tools and problems if they changed or are due again; never blocks."""
         news = self._watch.names(), trouble
         is_news = news != self._sent and now_ns >= self._sent_ns + NEWS_NS
         if not is_news and now_ns < self._due_ns:

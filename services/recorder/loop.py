@@ -13,7 +13,7 @@ from shared.exceptions import RunError
 from shared.mcap_log.writer import FilePlace, MessageSource, RunWriter
 
 _AT_ONCE: Final = 65_536
-"""Messages written in one cycle; the rest waits for the next."""
+"""Maximum messages written in one cycle; the rest waits for the next."""
 
 REPORT_PERIOD_S: Final = 10.0
 
@@ -33,7 +33,7 @@ class Recorder:
         free_bytes: FreeBytes,
         now_ns: int,
     ) -> None:
-        """Look at the disk, and start the first file.
+        """Check the disk, and start the first file.
 
         `writer` has no file started; `free_bytes` returns the free space where the run is written.
         Raises RunError if a file cannot be written, as all methods do.
@@ -47,12 +47,12 @@ class Recorder:
         self._report = Deadline(int(REPORT_PERIOD_S * NS_PER_S), now_ns)
         self._begun_ns = now_ns
         self.removed_files = self.removed_messages = 0
-        """Files that somebody removed while they were written, and what was in them."""
+        """Files that were removed while they were written, and their messages."""
         self._why_next = ""
-        """Why a file is to be begun as soon as one can be; "" if none is."""
+        """Why a new file must be started as soon as possible; "" if none must."""
         self._reported_unwritable = False
         self.trouble = ""
-        """Why nothing is recorded now, in words; "" if it is."""
+        """Why nothing is recorded now; "" while recording."""
         self._watch_space()
         self._begin(now_ns, {})
 
@@ -85,10 +85,10 @@ class Recorder:
             before = self._writer.path
             self._writer.finish()
             self._begin(now_ns, {"why": "time" if old else "size"})
-            self._logger.info("%s is finished; going on in %s", before, self._writer.path)
+            self._logger.info("%s is finished; continuing in %s", before, self._writer.path)
 
     def _watch_file(self, now_ns: int) -> None:
-        """Go on in the next file, if there can be one, where this one is not at its path."""
+        """Start the next file, if one is due and there is space for it."""
         self._leave_if_gone()
         if not self._why_next or not self._guard.enough:
             return
@@ -96,17 +96,17 @@ class Recorder:
             self._begin(now_ns, {"why": self._why_next})
         except RunError as error:
             if not self._reported_unwritable:
-                self._logger.error("%s; it is tried again", error)
+                self._logger.error("%s; retrying", error)
             self._reported_unwritable, self.trouble = True, f"not recorded: {error}"
             return
         self._why_next, self._reported_unwritable, self.trouble = "", False, ""
         left_out = self._writer.left_out
         self._logger.warning(
-            "recording goes on in %s; %d messages were left out", self._writer.path, left_out
+            "recording continues in %s; %d messages were left out", self._writer.path, left_out
         )
 
     def _leave_if_gone(self) -> None:
-        """Tell that the file is not at its path any more; one that was moved is finished there."""
+        """Log that the file was moved or deleted; a moved file is finished at its new place."""
         place = self._writer.where_is_file
         if place is FilePlace.THERE:
             return
@@ -116,15 +116,15 @@ class Recorder:
             self.removed_files += 1
             self.removed_messages += count
         self._logger.error(
-            "%s was %s while it was written, with %d messages", path, place.value, count
+            "%s was %s while being written, with %d messages", path, place.value, count
         )
-        self._why_next = f"the file before was {place.value}"
+        self._why_next = f"the previous file was {place.value}"
 
     def _watch_space(self) -> None:
-        """Stop before the disk is full, and go on when it no longer is."""
+        """Stop recording before the disk is full, and continue when it no longer is."""
         try:
             free = self._free_bytes()
-        except OSError:  # writing will tell
+        except OSError:  # writing will show it
             return
         where, least = self._writer.path.parent, self._config.free_min_mib
         match self._guard.feed(free):
@@ -137,7 +137,7 @@ class Recorder:
                 self._writer.finish()
                 self.trouble = (
                     f"{where}: {free // MIB} MiB free, less than recorder.free_min_mib = {least}: "
-                    "recording has stopped; it goes on when there is space again"
+                    "recording has stopped; it continues when there is space again"
                 )
                 self._logger.error("%s", self.trouble)
             case DiskChange.BACK:

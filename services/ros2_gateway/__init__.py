@@ -1,1 +1,1 @@
-"""ROS 2 gateway: shows the robot to ROS 2 over Zenoh, without ROS on board (docs/ros2.md)."""
+"""ROS 2 gateway: publishes the robot to ROS 2 over Zenoh, without ROS on board (docs/ros2.md)."""

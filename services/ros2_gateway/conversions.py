@@ -1,4 +1,4 @@
-"""Messages of the robot as messages of ROS 2. Pure."""
+"""Conversion of the robot's messages to ROS 2. Pure."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class RosTypes:
         """Return the message of a payload from the network; None if it is not of this type."""
         try:
             return self._store.deserialize_cdr(payload, type_name)
-        except Exception:  # noqa: BLE001 - whatever a stranger's bytes bring about
+        except Exception:  # noqa: BLE001 - unknown bytes may cause any error
             return None
 
     def definition(self, type_name: str) -> str:
-        """Return a type and those it is made of in ROS 2's message language."""
+        """Return a type's definition, with the types in it, in ROS 2's message language."""
         text, _ = self._store.generate_msgdef(type_name, ros_version=2)
         return text
 
@@ -80,7 +80,7 @@ MODE_LEVEL: Final = {
     Mode.FAULT: ERROR,
 }
 NOT_STOPPED: Final = "emergency stop"
-"""Key of the gateway's figures: the stop that ROS 2 asked for was given up."""
+"""Key of the gateway's figures for a stop of ROS 2 that was given up."""
 TIME_FIRST_NS: Final = 0
 TIME_LAST_NS: Final = (2**31 - 1) * NS_PER_S
 """Times of ROS 2 are 32-bit seconds since 1970: they end on 2038-01-19."""
@@ -88,16 +88,16 @@ _UNKNOWN_POSITION: Final = (*LOST_DRIVE, DriveStatus.UNZEROED)
 
 
 def knows_position(state: JointState) -> bool:
-    """Return True if a module's joint angles are those of the joint."""
+    """Return True if a module's joint angles are valid."""
     return DriveStatus(state.drive) not in _UNKNOWN_POSITION
 
 
 class Conversions:
-    """Makes the messages of one robot, whose namespace the names of the frames begin with.
+    """Converts the messages of one robot; frame names begin with its namespace.
 
-    Each method returns a message in CDR. Times are in ns since 1970, or of the log's clock; one
-    that ROS 2 cannot say becomes the first or the last that it can. A state, status or wrench that
-    is missing belongs to a process that is silent.
+    Each method returns a message in CDR. Times are in ns since 1970, or on the log's clock, and are
+    clipped to the range of ROS 2. A missing state, status or wrench means that its process is
+    silent.
     """
 
     def __init__(self, config: RobotConfig, types: RosTypes) -> None:
@@ -105,7 +105,7 @@ class Conversions:
         self._prefix = f"{config.ros2.namespace}/" if config.ros2.namespace else ""
 
     def joint_states(self, ns: int, states: Mapping[str, JointState]) -> bytes:
-        """Return `sensor_msgs/msg/JointState` of modules that know where they are: rad, N m."""
+        """Return `sensor_msgs/msg/JointState` of modules with a valid position: rad, N m."""
         modules = [name for name in MODULES if name in states]
         q, v, tau = (
             np.array([value for name in modules for value in getattr(states[name], part)], float)
@@ -125,7 +125,7 @@ class Conversions:
     ) -> bytes:
         """Return `tf2_msgs/msg/TFMessage`: torso in the world, COM, and the links of the URDF.
 
-        The torso is placed if there are all six states; the status gives COM and stance.
+        The torso is placed only with all six states; the status gives COM and stance.
         """
         geometry = self._config.geometry
         rows = [FramePose("torso", "harness", geometry.harness_point, UPRIGHT)]
@@ -203,7 +203,7 @@ class Conversions:
 
     def _planner_row(self, status: PlannerStatus | None) -> Any:
         if status is None:
-            return self._row("planner", STALE, "silent: each module holds by itself", {})
+            return self._row("planner", STALE, "silent: each module holds on its own", {})
         mode, reason = PlannerMode(status.mode), reason_of(status)
         values = {
             "margin": f"{status.margin:.2f}",

@@ -1,4 +1,4 @@
-"""Decides when which message goes to ROS 2, from the newest messages of the robot. Pure."""
+"""Decides which message goes to ROS 2 and when, from the robot's newest messages. Pure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shared.joints import MODULES
 from shared.robot.robot_urdf import urdf
 
 STALE_NS: Final = 500 * NS_PER_MS
-"""Older messages are history: their sender is dead, suspended or cut off."""
+"""Age above which messages are stale, ns: their sender is dead, suspended or cut off."""
 INPUTS: Final = (topics.JOINT_STATE, topics.PLANNER_STATUS, topics.WRENCH)
 """Topics of the robot that are received."""
 
@@ -57,10 +57,10 @@ def topics_of(namespace: str) -> RosTopics:
 
 
 class Gateway:
-    """Newest messages in, messages for ROS 2 out, each topic at its rate (`config.ros2`).
+    """Turns the robot's newest messages into messages of ROS 2, at its rates (`config.ros2`).
 
-    What is silent is not repeated: a joint state without a module, a transform without its torso. A
-    simulated robot tells the time as well.
+    Stale data is not repeated: joint states lack a silent module, and transforms then lack the
+    torso. A simulated robot also publishes the time.
     """
 
     def __init__(self, config: RobotConfig, convert: Conversions, *, simulated: bool) -> None:
@@ -80,7 +80,7 @@ class Gateway:
             (topic, round(NS_PER_S / rate_hz), make) for topic, rate_hz, make in sends if rate_hz
         ]
         self.figures: Callable[[], Mapping[str, object]] = dict
-        """Asked with each `/diagnostics`: what it tells of the gateway itself."""
+        """Called for each `/diagnostics`; returns the gateway's own figures."""
 
     @property
     def sent_topics(self) -> list[RosTopic]:
@@ -96,7 +96,7 @@ class Gateway:
         self._newest[topic, module] = now_ns, message
 
     def due(self, now_ns: int, unix_ns: int) -> list[_Outgoing]:
-        """Return what is to be sent now: at `unix_ns` for ROS 2, by the clock of `receive` here."""
+        """Return what is due now; `unix_ns` is for ROS 2, `now_ns` on the clock of `receive`."""
         found = []
         for topic, period_ns, make in self._sends:
             due_ns = self._next_ns.get(topic, now_ns)

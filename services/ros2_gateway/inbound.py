@@ -1,4 +1,4 @@
-"""What ROS 2 may ask of the robot, where it is let: assist, and the emergency stop. Pure."""
+"""Requests of ROS 2 to the robot, if accepted: assist and the emergency stop. Pure."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ class _InboundTopics(NamedTuple):
     estop: RosTopic
     """`std_msgs/msg/Bool`: true stops every module; nothing here ends a stop."""
     intent: RosTopic
-    """`std_msgs/msg/Float64`: assist, N; to be repeated, as `assist.stale_ms` says."""
+    """`std_msgs/msg/Float64`: assist, N; must be repeated, as `assist.stale_ms` says."""
 
 
 def inbound_topics(namespace: str) -> _InboundTopics:
-    """Return them, in a namespace such as `legs`, or in none."""
+    """Return the inbound topics, in a namespace such as `legs` or without one."""
     below = f"/{namespace}" if namespace else ""
     return _InboundTopics(
         RosTopic(f"{below}/xrl/estop", "std_msgs/msg/Bool"),
@@ -42,10 +42,10 @@ def inbound_topics(namespace: str) -> _InboundTopics:
 
 
 def acceptable(words: str) -> tuple[str, ...]:
-    """Return what `--accept` names, such as `intent,estop`; FleetError if it is none of these."""
+    """Parse `--accept`, such as `intent,estop`; FleetError for anything else."""
     names = [word for word in words.split(",") if word]
     if not names or not set(names) <= set(ACCEPTABLE):
-        raise FleetError(f"--accept {words}: intent or estop or intent,estop is right")
+        raise FleetError(f"--accept {words}: must be intent, estop or intent,estop")
     return tuple(name for name in ACCEPTABLE if name in names)
 
 
@@ -59,12 +59,12 @@ class Inbound:
         self._stop_since_ns: int | None = None
         self._next_stop_ns = 0
         self.refused = 0
-        """Messages that were none, or asked for what cannot be given."""
+        """Messages that could not be read, or requested the impossible."""
         self.not_stopped = False
-        """The last stop was given up before every module had stopped."""
+        """True if the last stop was given up before every module had stopped."""
 
     def receive(self, topic: RosTopic, message: Any | None, now_ns: int) -> None:
-        """Take a message of one of `inbound_topics`; None: it could not be read."""
+        """Process a message of one of `inbound_topics`; None if it could not be read."""
         if message is None:
             self.refused += 1
         elif topic == self._topics.estop:
@@ -79,9 +79,9 @@ class Inbound:
     def intent(
         self, now_ns: int, number: int, status: PlannerStatus | None
     ) -> OperatorIntent | None:
-        """Return the intent that just came, once; None: there is none, or another leads.
+        """Return a new intent, once; None without one, or if another operator leads.
 
-        `number` is that of the intents sent so far; `status` tells whose intent the planner
+        `number` is the count of intents sent so far; `status` shows whose intent the planner
         follows.
         """
         assist_n, self._assist_n = self._assist_n, None
@@ -93,10 +93,10 @@ class Inbound:
         return OperatorIntent(t_ns=now_ns, seq=number, assist_n=assist_n, source=SOURCE)
 
     def stop_due(self, now_ns: int, modes: Sequence[tuple[int, int]], of: int) -> bool:
-        """Return True if the stop is to be put on the bus now.
+        """Return True if the stop must be published now.
 
-        `modes` has when each module's newest state arrived, ns, and its mode. What was heard before
-        the request does not count: a module may be silent since.
+        `modes` has when each module's newest state arrived, ns, and its mode. States from before
+        the request do not count, because a module may have been silent since.
         """
         since_ns = self._stop_since_ns
         if since_ns is None:

@@ -1,4 +1,4 @@
-"""Runs the gateway's loop: take the robot's newest messages, give ROS 2 what is due."""
+"""The gateway's loop: takes the robot's newest messages, and publishes what is due to ROS 2."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class GatewayLoop:
     def accept(
         self, inbound: Inbound, intents: Publisher[OperatorIntent], stops: Publisher[Estop]
     ) -> None:
-        """Pass requests from ROS 2 on from now on."""
+        """Forward requests from ROS 2 from now on."""
         self._inbound, self._intents, self._stops = inbound, intents, stops
 
     def cycle(self, now_ns: int, unix_ns: int) -> None:
@@ -67,7 +67,7 @@ class GatewayLoop:
         self.cycles += 1
 
     def figures(self) -> dict[str, object]:
-        """Return what `/diagnostics` and the log tell of the gateway."""
+        """Return the gateway's own figures for `/diagnostics` and the log."""
         ros = self._link.session
         found: dict[str, object] = {"sent": self.sent, "not sent": ros.failed if ros else 0}
         if self._inbound is not None:

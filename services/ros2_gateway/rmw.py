@@ -1,4 +1,4 @@
-"""What rmw_zenoh makes of ROS 2 names: keys, liveliness tokens, attachments. Pure.
+"""ROS 2 names as rmw_zenoh maps them: keys, liveliness tokens, attachments. Pure.
 
 The contract is the design page of rmw_zenoh, as of the distribution Jazzy:
 
@@ -27,16 +27,16 @@ Kind: TypeAlias = Literal["MP", "MS"]
 
 
 class Qos(NamedTuple):
-    """Quality of service of an endpoint, as far as it is told to others."""
+    """Quality of service of an endpoint, as far as it is announced to others."""
 
     reliable: bool = True
     transient_local: bool = False
-    """A subscription that comes later gets the newest messages."""
+    """True if a later subscription gets the newest messages."""
     depth: int = 10
     """Messages that are kept."""
 
     def encode(self) -> str:
-        """Return it as in a token; what is rmw's default stays empty."""
+        """Return it as in a token; values that are rmw's default stay empty."""
         reliability = "" if self.reliable else "2"
         durability = "1" if self.transient_local else ""
         return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
@@ -60,14 +60,14 @@ class RosNode(NamedTuple):
     session: str
     """Zenoh's id of its session."""
     namespace: str
-    """`/`, or such as `/legs`."""
+    """`/`, or a namespace such as `/legs`."""
     name: str
 
 
 def domain(text: str) -> int:
-    """Return a domain from a command line; ArgumentTypeError outside of 0 to 232."""
+    """Return a domain from a command line; ArgumentTypeError outside 0 to 232."""
     if not (text.strip().isdecimal() and int(text) <= DOMAIN_MAX):
-        raise argparse.ArgumentTypeError(f"{text[:40]!r}: a domain is from 0 to {DOMAIN_MAX}")
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: must be between 0 and {DOMAIN_MAX}")
     return int(text)
 
 
@@ -99,17 +99,17 @@ def endpoint_token(node: RosNode, number: int, kind: Kind, topic: RosTopic, type
 
 
 def gid_of(token: str) -> bytes:
-    """Return the 16 bytes that tell an endpoint from all others, from its token."""
+    """Return the 16 bytes that identify an endpoint, from its token."""
     return hashlib.blake2b(token.encode(), digest_size=GID_SIZE).digest()
 
 
 def attachment(number: int, unix_ns: int, gid: bytes) -> bytes:
-    """Return what goes with a message: its number, when it was sent, by whom."""
+    """Return a message's attachment: its number, time and sender."""
     return struct.pack(f"<qqB{GID_SIZE}s", number, unix_ns, GID_SIZE, gid)
 
 
 class SeenEndpoint(NamedTuple):
-    """A node or an endpoint of somebody, as read from its token."""
+    """A node or an endpoint, as read from its token."""
 
     kind: str
     """NN, MP, MS, SS or SC."""

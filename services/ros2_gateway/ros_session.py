@@ -1,4 +1,4 @@
-"""Session on the Zenoh network of ROS 2, as a node of it; apart from the robot's own bus."""
+"""Session of a node on the Zenoh network of ROS 2, separate from the robot's own bus."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from shared.exceptions import BusError
 NODE: Final = "xrl"
 """Name of the gateway's node."""
 _SETTINGS: Final[dict[str, object]] = {
-    # A router passes everything on to a client, and a client that has lost it dials it again. Two
-    # peers that listen nowhere, or on another host's loopback as ROS 2's do, find no way.
+    # A router forwards everything to a client, and a client that has lost it dials it again. Two
+    # peers cannot connect if both listen nowhere, or on another host's loopback as ROS 2's do.
     "mode": "client",
     "scouting/multicast/enabled": False,
     "connect/timeout_ms": 1000,
     "connect/exit_on_failure": True,
     "connect/retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2.0},
-    "timestamping/enabled": True,  # the cache of a transient-local publisher asks for it
+    "timestamping/enabled": True,  # needed by the cache of a transient-local publisher
 }
 _QUEUE: Final = 64
 _ANSWER_S: Final = 0.5
@@ -41,9 +41,9 @@ class RosSession:
     def __init__(
         self, router: str, domain: int, types: RosTypes, *, namespace: str = "", name: str = NODE
     ) -> None:
-        """Open the session by the router's endpoint; takes up to a second.
+        """Open the session at the router's endpoint; takes up to a second.
 
-        BusError without an answer.
+        BusError if no router answers.
         """
         config = zenoh.Config()
         for key, value in {**_SETTINGS, "connect/endpoints": [router]}.items():
@@ -51,7 +51,7 @@ class RosSession:
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise BusError(f"{router}: no router of ROS 2 answers: {error}") from None
+            raise BusError(f"{router}: no ROS 2 router answers: {error}") from None
         self._types, self._domain = types, domain
         self._node = RosNode(domain, str(self._session.zid()), f"/{namespace}", name)
         self._tokens: list[zenoh.LivelinessToken] = []
@@ -66,12 +66,12 @@ class RosSession:
         return self
 
     def __exit__(self, *_error: object) -> None:
-        """Close it."""
+        """Close the session."""
         self.close()
 
     def close(self) -> None:
-        """Leave the network: node and topics are gone from its graph."""
-        with contextlib.suppress(zenoh.ZError):  # it timed out: the process leaves anyway
+        """Leave the network; node and topics disappear from its graph."""
+        with contextlib.suppress(zenoh.ZError):  # it timed out; the process ends anyway
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
     def show_node(self) -> None:
@@ -110,10 +110,10 @@ class RosSession:
             self.failed += 1
 
     def take(self) -> list[tuple[RosTopic, Any | None]]:
-        """Return what has come since the last call; None for what could not be read."""
+        """Return the messages since the last call; None for one that could not be read."""
         found = []
         for topic, subscriber in self._subscribers:
-            for _ in range(_QUEUE):  # no more: a flood of one does not starve the next
+            for _ in range(_QUEUE):  # limited, so a flood of one does not starve the next
                 sample = subscriber.try_recv()
                 if sample is None:
                     break
@@ -139,10 +139,10 @@ class RosSession:
 
 
 class RosLink:
-    """Opens a session in a thread of its own, again and again until the router is there.
+    """Opens a session in its own thread, and retries until the router is there.
 
-    `opened` opens and declares, and raises where there is no router; `failed` is told the first
-    time.
+    `opened` opens and declares, and raises without a router; `failed` is called with the first
+    failure.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class RosLink:
         self._open, self._failed = opened, failed
         self._left = threading.Event()
         self.session: RosSession | None = None
-        """The session, once it is open; it then lasts, whether its router does or not."""
+        """The session, once it is open; it then lasts, even if its router does not."""
         self._thread = threading.Thread(target=self._dial, name="ros2-router", daemon=True)
         self._thread.start()
 

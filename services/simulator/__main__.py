@@ -56,9 +56,9 @@ def main() -> int:
         type=float,
         default=0.0,
         metavar="M",
-        help="hang the robot this much higher, its feet clear of the floor (0: soles on it)",
+        help="hang the robot M metres higher, its feet clear of the floor (0: soles on it)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the sensors' noise")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the sensors' noise")
     arguments = parser.parse_args()
     logger = log.setup("simulator")
     robot = config_file.load(arguments.config)
@@ -101,7 +101,7 @@ def main() -> int:
 
 
 def _open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
-    """Return the CAN buses of the robot, simulated, by name."""
+    """Return the robot's simulated CAN buses by name."""
     make_live_dir(run_dir)
     sensors = [robot.harness.bus, *([robot.imu.bus] if robot.imu.fitted else [])]
     hubs = {
@@ -118,7 +118,7 @@ def _open_usb(
 ) -> list[FibreHub]:
     """Return the drives' USB plugs, in {run}/usb, for the modules that have serial numbers.
 
-    An ODrive v3 has USB beside CAN, so they are there whichever the services use.
+    An ODrive v3 has USB and CAN, so the plugs exist whichever the services use.
     """
     folder = live_dir(run_dir) / FOLDER
     ports: list[FibrePort] = []

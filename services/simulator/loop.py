@@ -21,11 +21,11 @@ from shared.config.scenarios import SCENARIO
 from shared.process import StopFlag
 
 SILENT_INTENTS: Final = 250
-"""Intents of the scenario left out after somebody else's last: until that has faded out."""
+"""Number of the scenario's intents to skip after another operator's last, until it has faded."""
 
 
 class SimulatorPorts(msgspec.Struct, frozen=True):
-    """The simulator's bus ends."""
+    """Publishers and subscriptions of the simulator."""
 
     truth: Publisher[SimTruth]
     intent: Publisher[OperatorIntent]
@@ -36,11 +36,11 @@ class SimulatorPorts(msgspec.Struct, frozen=True):
 
 
 class Pace(msgspec.Struct):
-    """What was skipped of the clock, and where all stood when the scenario started."""
+    """Skipped time, and the clock, step and skipped time at the start of the scenario."""
 
     lost_ns: int = 0
     start_ns: int = 0
-    """0: it has not started."""
+    """0 before the start."""
     start_step: int = 0
     lost_at_start_ns: int = 0
 
@@ -48,7 +48,7 @@ class Pace(msgspec.Struct):
 def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tuple[float, Vector4]:
     """Return the assist, N, and the shift, clamped to what the planner would grant.
 
-    Asked for 1e9 N, the simulated person rested 1e9 N on the robot.
+    Without the clamp, a request of 1e9 N made the simulated person rest 1e9 N on the robot.
     """
     x, y, roll, yaw = (
         clamp(part, -most, most) for part, most in zip(asked.shift, shift_max, strict=True)
@@ -57,13 +57,13 @@ def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tup
 
 
 class SimulatorLoop:
-    """Steps twelve emulated axes and the world, and paces them by the clock.
+    """Loop that steps twelve emulated axes and the world at the pace of the clock.
 
     The drives receive and send at the rate of their encoder frames. In torque mode they hold their
-    torque between frames; with a loop of their own they step with the world.
+    torque between frames; in position or velocity mode they step with the world.
 
     Attributes:
-        autostart_s: delay from hoist down to the start of the scenario, s; None: a message
+        autostart_s: delay from hoist down to the start of the scenario, s; None if a message
             starts it.
     """
 
@@ -98,9 +98,9 @@ class SimulatorLoop:
     def run(self, stop: StopFlag) -> None:
         """Run until stopped.
 
-        A step that exchanges nothing follows the one before it in the same wake-up. A late step is
-        followed at once by the next. Time further behind than `late_slip_ms` is skipped and
-        counted, because the services must not receive a burst.
+        A step without an exchange runs in the same wake-up as the previous one. After a late step,
+        the next follows at once. A delay beyond `late_slip_ms` is skipped and counted, so that the
+        services do not receive a burst.
         """
         due = now_ns()
         while not stop:
@@ -116,7 +116,7 @@ class SimulatorLoop:
             sleep_until(due)
 
     def step(self) -> None:
-        """Apply the drives' frames, advance the world by one step, send what is due."""
+        """Apply the drives' frames, advance the world by one step, send the due messages."""
         robot, front, every = self._robot, self._front, self._every
         begins_ns = self._steps * every.step
         if begins_ns % every.encoders == 0:
@@ -149,7 +149,7 @@ class SimulatorLoop:
         return not any(exchanged) and not any(hub.clients for hub in self._usb)
 
     def _ask(self) -> None:
-        """Publish the scenario's request; if another operator publishes one, rest that much."""
+        """Publish the scenario's request, or adopt the request of another operator."""
         world, other = self._world, self._ports.asked.take()
         if other is not None and other.source != SCENARIO:
             self._unasked = 0
@@ -175,7 +175,7 @@ class SimulatorLoop:
         self._ports.intent.put(intent)
 
     def _publish_truth(self) -> None:
-        """Publish the truth, and look at what needs no more than its rate."""
+        """Publish the truth; at the same rate, handle requests, the start and the hoist."""
         world, pace, now = self._world, self._pace, now_ns()
         control, hand = self._ports.control.take(), self._ports.hand.take()
         if hand is not None:

@@ -1,7 +1,7 @@
-"""The simulated robot, assembled once for the simulator's process and for lockstep. Pure.
+"""The simulated robot, shared by the simulator's process and by lockstep. Pure.
 
-World, twelve emulated axes, load cells and IMU, and the faults that a scenario injects into the
-drives. What differs between the two is clock, bus and network alone.
+It consists of the world, twelve emulated axes, load cells, an IMU, and the faults that a scenario
+injects into the drives. Process and lockstep differ only in clock, bus and network.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Periods(NamedTuple):
     state: int
 
     @classmethod
-    def of(cls, config: RobotConfig) -> Periods:
-        """Return the periods that the robot file asks for."""
+    def from_config(cls, config: RobotConfig) -> Periods:
+        """Return the periods for the rates in the robot file."""
         simulation = config.simulation
         step_ns = round(simulation.timestep * NS_PER_S)
         rates_hz = (
@@ -68,12 +68,12 @@ def axes_by_bus(config: RobotConfig) -> dict[str, dict[int, int]]:
 
 
 class SimulatedRobot:
-    """World, drives and sensors; its drives step before the world does.
+    """World, drives and sensors; the drives step before the world.
 
     Attributes:
         harness: the load cells.
-        imu: None if none is fitted.
-        every: periods of all that comes at a rate.
+        imu: None if no IMU is fitted.
+        every: periods of the periodic exchanges.
     """
 
     def __init__(
@@ -92,10 +92,10 @@ class SimulatedRobot:
         Args:
             config: the robot file.
             plant: how the true robot differs from it.
-            scenario: what happens, faults of drives included.
+            scenario: course of the run, with the faults of drives.
             cells: CAN bus of the load cells.
-            imu: CAN bus of the IMU; None if none is fitted.
-            seed: of the sensors' noise.
+            imu: CAN bus of the IMU; None if no IMU is fitted.
+            seed: seed of the sensors' noise.
             lifted: height of the soles above the floor, m.
         """
         self.world = World(body_of(config, plant), scenario, lifted)
@@ -107,7 +107,7 @@ class SimulatedRobot:
         )
         self.harness = HarnessFront(config, cells, seed)
         self.imu = None if imu is None else ImuFront(config.imu, plant.imu, imu, seed)
-        self.every = Periods.of(config)
+        self.every = Periods.from_config(config)
         self._faults = FaultInjector(scenario.fault, self.bank)
         self._torque = self.bank.torque
 
@@ -116,7 +116,7 @@ class SimulatedRobot:
         return self._faults.advance(self.world.scenario_s)
 
     def step_drives(self) -> None:
-        """Step the axes: with each of their samples, and with the world if they regulate."""
+        """Step the axes: at each encoder sample, and at each step of the world if they regulate."""
         self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
 
     def step_world(self) -> None:
@@ -149,7 +149,7 @@ class SimulatedRobot:
     def write_state(self, state: SimState) -> None:
         """Continue from a state of the same robot and scenario; this robot must be new.
 
-        Errors and conditions of the drives are not in it: an axis that is not armed is idle.
+        The state lacks errors and conditions of the drives: an axis that is not armed is idle.
         """
         world, bank = self.world, self.bank
         world.resume(state)
@@ -164,9 +164,9 @@ class SimulatedRobot:
 
 
 _AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
-"""Momentary kinds, with the bank's fault."""
+"""Momentary kinds of faults, with the bank's name for each."""
 _PULSED: Final = {"bus_full": (0.04, 0.1), "bus_flap": (0.06, 0.15)}
-"""Lasting kinds that come and go: how long each time, and how often, s."""
+"""Lasting kinds that come and go: duration and period, s."""
 _ABOVE: Final = 5.0
 """V or C beyond the limit."""
 
@@ -181,7 +181,7 @@ class FaultInjector:
         self._lasting: list[Fault] = []
 
     def advance(self, scenario_s: float) -> list[Fault]:
-        """Start and end what is due at scenario time; return the faults that started."""
+        """Start and end the faults due at scenario time; return those that started."""
         if not self._coming and not self._lasting:
             return []
         for fault in [row for row in self._lasting if scenario_s >= row.at + row.lasts_s]:
@@ -202,7 +202,7 @@ class FaultInjector:
         return begun
 
     def _act(self, fault: Fault, *, begins: bool) -> None:
-        """Bring a drive into a lasting fault, or out of it."""
+        """Start or end a lasting fault of a drive."""
         bank, axis = self._bank, _axis_of(fault)
         drive = axis >> 1
         match fault.kind:
@@ -225,9 +225,9 @@ class FaultInjector:
             case "brown_out":
                 bank.supply(drive, 0.0 if begins else SUPPLY_VOLTAGE)
             case _:
-                raise DriveError(f"{fault.kind}: no lasting fault of the emulated drives")
+                raise DriveError(f"{fault.kind}: not a lasting fault of the emulated drives")
 
 
 def _axis_of(fault: Fault) -> int:
-    """Return the axis (0 .. 11) that a fault is of; of the whole ODrive, its first."""
+    """Return a fault's axis (0 .. 11); the first axis if the whole ODrive is faulty."""
     return 2 * MODULE_INDEX[fault.module] + (fault.axis or 0)

@@ -1,4 +1,4 @@
-"""Encodes and decodes messages; refuses numbers that are not finite (docs/networks.md)."""
+"""Encode and decode messages; refuse numbers that are not finite (docs/networks.md)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ M = TypeVar("M", bound=Message)
 
 
 def _plain(value: object) -> object:
-    """Return the Python number of a NumPy scalar, which msgspec does not encode by itself."""
+    """Return the Python number of a NumPy scalar, which msgspec does not encode on its own."""
     return value.item()  # type: ignore[attr-defined]  # raises what `encode` reports
 
 
@@ -26,14 +26,14 @@ def encode(message: Message) -> bytes:
 
     Raises:
         NonFiniteError: a number is NaN or infinite. msgspec writes it as null, which no message's
-            type allows, since it has no optional field.
-        EncodeError: a value is no number, text or list, or an integer of more than 64 bits.
+            type allows, since no field is optional.
+        EncodeError: a value has no JSON form, or an integer has more than 64 bits.
     """
     try:
         payload = _ENCODER.encode(message)
     except _UNENCODABLE as error:
         raise EncodeError(f"{_where(message)}; not sent") from error
-    if b"null" in payload:  # or the word in a text: its own type tells
+    if b"null" in payload:  # may also be the word in a text: the type decides
         try:
             msgspec.json.decode(payload, type=type(message))
         except msgspec.ValidationError:
@@ -55,7 +55,7 @@ def _where(message: Message) -> str:
 
 
 class Decoder(Generic[M]):
-    """Decodes one type of message; what does not fit is counted, not raised."""
+    """Decoder of one type of message; it counts malformed payloads instead of raising."""
 
     def __init__(self, message_type: type[M]) -> None:
         self._decoder = msgspec.json.Decoder(message_type)
@@ -64,7 +64,7 @@ class Decoder(Generic[M]):
     def decode(self, payload: bytes) -> M | None:
         """Return the message, or None if the payload is malformed, which is counted.
 
-        null, NaN and infinities fail the type check: null is no float, JSON has no literal for the
+        null, NaN and infinities are malformed: null is not a float, and JSON has no literal for the
         others.
         """
         try:

@@ -24,19 +24,19 @@ from shared.toml_file import Section, read_toml
 
 AUTHORITY: Final = "authority.pem"
 NAMES: Final = "names.toml"
-_HELP: Final = "`xrl keys pack` makes this host's keys (docs/security.md)"
+_HELP: Final = "make this host's keys with `xrl keys pack` (docs/security.md)"
 
 
 class Names(Section, frozen=True):
-    """`names.toml`: whose keys these are."""
+    """Content of `names.toml`: the robot and its names."""
 
     robot: str
     generations: dict[str, int]
-    """Current generation of each name; certificates of earlier ones are no longer let in."""
+    """Current generation of each name; certificates of earlier generations are rejected."""
 
 
 class Credentials(NamedTuple):
-    """What one process proves itself with, and whom it believes."""
+    """Certificate and key of one process, and what it trusts."""
 
     name: str
     """One of `PRINCIPALS`."""
@@ -52,17 +52,17 @@ def keys_folder(robot: RobotConfig) -> Path:
 
 
 def certificate_file(folder: Path, name: str) -> Path:
-    """Return where a name's certificate lies."""
+    """Return the path of a name's certificate."""
     return folder / f"{name}.pem"
 
 
 def key_file(folder: Path, name: str) -> Path:
-    """Return where a name's private key lies."""
+    """Return the path of a name's private key."""
     return folder / f"{name}.key"
 
 
 def read_names(folder: Path) -> Names:
-    """Return whose keys a folder holds; BusError if there are none, or `names.toml` is wrong."""
+    """Read `names.toml` of a folder; BusError if it is missing or invalid."""
     file = folder / NAMES
     if not file.is_file():
         raise BusError(f"{folder}: no keys for `mtls` here ({NAMES} is missing); {_HELP}")
@@ -72,8 +72,8 @@ def read_names(folder: Path) -> Names:
         raise BusError(str(error)) from None
     strange = sorted(set(names.generations) - set(PRINCIPALS))
     if strange:
-        right = f"one of {', '.join(PRINCIPALS)}"
-        raise BusError(f"{file}: generations.{strange[0]}: no such name; {right}")
+        right = f"use one of {', '.join(PRINCIPALS)}"
+        raise BusError(f"{file}: generations.{strange[0]}: not a valid name; {right}")
     return names
 
 
@@ -83,16 +83,16 @@ def held_names(folder: Path) -> frozenset[str]:
 
 
 def read_credentials(robot: RobotConfig, process: str) -> Credentials:
-    """Return what a process of this host proves itself with.
+    """Return the credentials of a process of this host.
 
-    A tool is the operator if this host has the operator's key, else a viewer. Raises BusError if
-    something is missing, another robot's, or readable for others.
+    A tool is the operator if this host has the operator's key, else a viewer. Raises BusError if a
+    file is missing, belongs to another robot, or is readable by others.
     """
     folder = keys_folder(robot)
     names = read_names(folder)
     if names.robot != robot.name:
         raise BusError(
-            f"{folder}: keys of robot {names.robot!r}; those of {robot.name!r} are right"
+            f"{folder}: these are the keys of robot {names.robot!r}, not of {robot.name!r}"
         )
     wanted = (process,) if process in SERVICES else (OPERATOR, VIEWER)
     name = next((name for name in wanted if key_file(folder, name).exists()), wanted[-1])
@@ -108,24 +108,24 @@ def read_credentials(robot: RobotConfig, process: str) -> Credentials:
 
 
 def require_operator(robot: RobotConfig, process: str) -> None:
-    """Make sure that the modules heed what this host sends; only `mtls` tells who sends.
+    """Check that modules accept what this host sends; only `mtls` identifies senders.
 
-    Raises BusError if this host has no key, FleetError if it has another than an operator's.
+    Raises BusError if this host has no key, FleetError if the key is not an operator's.
     """
     if robot.bus.security.mode != "mtls":
         return
     name = read_credentials(robot, process).name
     if name != OPERATOR:
-        raise FleetError(f"this host has the key of a {name}; to act takes an operator's")
+        raise FleetError(f"this host has the key of a {name}; this command needs an operator's key")
 
 
 def check_private(key: Path) -> None:
-    """Raise BusError for a private key that is somebody else's, or that others may read."""
+    """Raise BusError for a private key that belongs to another user or that others may read."""
     found = key.stat()
     if found.st_uid != os.geteuid():
-        raise BusError(f"{key}: belongs to another user; a private key is its service's own")
+        raise BusError(f"{key}: belongs to another user; the service's user must own it")
     if stat.S_IMODE(found.st_mode) & 0o077:
-        raise BusError(f"{key}: others may read it; `chmod 600 {key}`")
+        raise BusError(f"{key}: other users can read it; run `chmod 600 {key}`")
     try:
         key.read_bytes()
     except OSError as error:

@@ -1,7 +1,7 @@
 """Every message on the bus (docs/networks.md).
 
 Payloads are JSON by msgspec. SI units; times are integers in ns; enumerations are integers. No
-field is optional: a `null` in a payload can then only be a number that was not finite, and
+field is optional, so a `null` in a payload can only be a number that was not finite.
 `shared.bus.codec` refuses it at both ends.
 """
 
@@ -13,106 +13,102 @@ from typing import Annotated, Final
 import msgspec
 
 Int64 = Annotated[int, msgspec.Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-"""An integer of 64 bits. JSON has no largest: one of 400 digits would be an exception where it
-first meets a float, so it is refused as it is decoded."""
+"""64-bit integer. Decoding refuses larger ones, which would raise where they first meet a float."""
 Pair = tuple[float, float]
 """(phi, theta) of one module."""
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
 LEFT_MAX_S = 3600.0
-"""Seconds left at a load beyond which they are not told apart: an hour or more."""
+"""Maximum reported `heat_left_s`, s."""
 STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
 """No shift of x, y, roll and yaw."""
 AS_CONFIGURED: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""A stance with the feet where the robot file has them."""
+"""Feet where the robot file has them."""
 Modules = tuple[Int64, Int64, Int64, Int64, Int64, Int64]
-"""One integer for each module, in `shared.joints.MODULES` order."""
+"""One integer per module, in `shared.joints.MODULES` order."""
 
 
 class Mode(IntEnum):
     """Mode of a joint service (docs/architecture.md#modes)."""
 
     DISARMED = 0
-    """No torque; the drive is not armed."""
+    """No torque; drive not armed."""
     HOLD = 1
     """References frozen; stands on local gains."""
     TRACK = 2
     """Follows the planner's commands."""
     DAMP = 3
-    """After an emergency stop: sinks slowly; after a fall: only damps."""
+    """Sinks slowly after an emergency stop; only damps after a fall."""
     FAULT = 4
-    """The drive, or its position, is lost; left by a restart only."""
+    """Drive or position lost; only a restart leaves it."""
 
 
 class Cause(IntEnum):
     """Cause of the last change of mode."""
 
     NONE = 0
-    """No change so far."""
+    """No change yet."""
     DRIVE_ARMED = 1
-    """The drive is armed."""
     COMMANDS_FRESH = 2
-    """Commands were fresh for long enough."""
+    """Commands were fresh long enough."""
     COMMAND_STALE = 3
     """The newest command is too old."""
     HOLD_ALL = 4
-    """The planner asks all six modules to hold."""
+    """The planner requests HOLD from all six modules."""
     ESTOP = 5
-    """Emergency stop."""
     DRIVE_LOST = 6
     """No frames from the drive."""
     DRIVE_DISARMED = 7
-    """The drive left closed loop by itself."""
+    """The drive left closed loop on its own."""
     POSITION_LOST = 8
-    """The joint's position is unknown: the drive is unzeroed, or its samples jump."""
+    """The drive is unzeroed, or its samples jump."""
     SHAKING = 9
-    """A trip of this module (`shared.robot.trip_table`)."""
+    """Shaking trip (`shared.robot.trip_table`)."""
     TORQUE_LIMIT = 10
-    """A trip of this module."""
+    """Torque trip."""
     TOO_FAST = 11
-    """A trip of this module."""
+    """Speed trip."""
     PLANNER_ENDED = 12
-    """The process of its planner, on the same host, has ended."""
+    """The planner's process on this host ended."""
     FALLEN = 13
-    """The planner says that the robot has fallen."""
+    """The planner reports a fall."""
 
 
 class Trip(IntEnum):
-    """Trip of the planner: why it does not lead (`shared.robot.trip_table`)."""
+    """Limit that keeps the planner from leading (`shared.robot.trip_table`)."""
 
     NONE = 0
     LEGS = 1
-    """The legs disagree about the torso's pose."""
+    """Legs disagree about the torso's pose."""
     REACH = 2
-    """The reference pose is out of reach."""
+    """Reference pose out of reach."""
     TRACKING = 3
     """A joint is far from its reference."""
     UNLOADED = 4
     """A leg carries hardly any load."""
     SINKING = 5
-    """The torso sinks or rises too fast."""
+    """COM sinks or rises too fast."""
     TURNING = 6
-    """The torso turns too fast."""
+    """Torso turns too fast."""
     HARNESS = 7
-    """The harness force is far from the requested assist."""
+    """Harness force far from the requested assist."""
     SAGGING = 8
-    """The person sinks with weight on the harness."""
+    """Person sinks with weight on the harness."""
     UNATTENDED = 9
-    """The robot drifts and nobody holds it."""
+    """Robot drifts with nobody holding it."""
     EDGE = 10
-    """A sole is loaded near its edge: the robot is leaned on from the side."""
+    """Load near a sole's edge: a lean from the side."""
     TIPPING = 11
-    """A sole is loaded at its edge: the robot is shoved from the side."""
+    """Load at a sole's edge: a shove from the side."""
     OFF_BALANCE = 12
-    """The COM is far ahead of or behind where the law holds it."""
+    """COM far ahead of or behind its reference."""
 
 
 class Outside(IntEnum):
-    """Part of a command that lies outside the envelope (`services.joint.envelope`)."""
+    """Value of a command that lies outside the envelope (`services.joint.envelope`)."""
 
     NOTHING = 0
-    """The command is inside."""
     K_P = 1
     K_D = 2
     TAU_FF = 3
@@ -122,38 +118,38 @@ class Outside(IntEnum):
     """Too far from the joint's position."""
     V_REF = 7
     TORQUE_STEP = 8
-    """The torque would change faster than the law changes it."""
+    """Faster than the law changes the torque."""
     MARGIN = 9
-    """The margin is below the least that the planner may publish."""
+    """Below the planner's minimum."""
     COUPLED_WORK = 10
-    """The coupled torque drives the joint away from its reference."""
+    """Coupled torque drives the joint away from its reference."""
     Q_REF_ASTRAY = 11
-    """The reference goes another way than its rate says."""
+    """Reference does not follow its rate."""
     COUPLED_ENERGY = 12
-    """The coupled torque drives the joint along."""
+    """Coupled torque does too much work on the moving joint."""
 
 
 class Refusal(IntEnum):
-    """Cause for which a joint service refused a command (docs/architecture.md#age-rule)."""
+    """Reason for a refused command (docs/architecture.md#age-rule)."""
 
     NONE = 0
-    """None was refused lately."""
+    """No recent refusal."""
     TOO_OLD = 1
-    """It answers a state that is too old."""
+    """Echoes a state that is too old."""
     FROM_THE_FUTURE = 2
-    """It answers a state that this module has not sent yet."""
+    """Echoes a state that this module has not sent yet."""
     FOREIGN_SESSION = 3
-    """Another planner sends it, or one that this module has left."""
+    """From another planner, or one that this module has left."""
     NOT_NEWER = 4
-    """One with its number or a higher one was accepted before."""
+    """Sequence number not above the last accepted."""
     OUT_OF_LIMITS = 5
-    """A number is not finite, or beyond what the joint service may be told."""
+    """Not finite, or beyond the joint service's limits."""
     OUT_OF_ENVELOPE = 6
-    """It lies outside the envelope (`Outside`)."""
+    """See `Outside`."""
     TOO_FAR_AHEAD = 7
-    """Its number is higher than any planner can have counted to since the last one."""
+    """Sequence number that no planner can have reached."""
     MALFORMED = 8
-    """It is no command: no JSON, or with a null or a number that is not finite. Of no session."""
+    """No JSON, a wrong field, or a number that is not finite; has no session."""
 
 
 class DriveStatus(IntEnum):
@@ -162,63 +158,62 @@ class DriveStatus(IntEnum):
     LOST = 0
     """No frames, or the link is down."""
     IDLE = 1
-    """Both axes answer; at least one is not in closed loop, and neither reports an error."""
+    """Both axes answer without error, but not both are in closed loop."""
     ARMED = 2
-    """Both axes are in closed loop."""
+    """Both axes in closed loop."""
     ERROR = 3
-    """At least one axis reports an error or left closed loop by itself."""
+    """An axis reports an error or left closed loop on its own."""
     UNZEROED = 4
-    """Both axes answer, but the zero was lost with the power."""
+    """Both axes answer; the zero was lost with the power."""
     HOLDING = 5
-    """Both axes are in closed loop by an earlier service and wait for the take-over."""
+    """Left in closed loop by an earlier service; waits for the take-over."""
     UNACKNOWLEDGED = 6
-    """Lost, and the CAN bus carries no frame: no node acknowledges its frames."""
+    """Lost; no node acknowledges frames."""
 
 
 LOST_DRIVE: Final = (DriveStatus.LOST, DriveStatus.UNACKNOWLEDGED)
-"""Statuses of a drive that is not heard, or cannot be told anything."""
+"""Statuses of an unreachable drive."""
 
 
 class PlannerMode(IntEnum):
-    """Mode of the planner: its request to the six modules."""
+    """Mode of the planner; all six modules hold unless stated otherwise."""
 
     WAITING = 0
-    """Some module's state is stale: all hold."""
+    """A module's state is stale."""
     ALIGNING = 1
-    """All six states are fresh; commands start from the measured pose, still with `hold`."""
+    """All states fresh; commands start from the measured pose, still with `hold`."""
     LEADING = 2
     """All six track."""
     OVERLOADED = 3
-    """The harness is overloaded: all hold until it has been released for a while."""
+    """Harness overloaded within the last `harness.overload_release_s`."""
     UNCERTIFIED = 4
-    """No local gains stand alone in this pose: all hold."""
+    """No local gains meet the certificate in this pose."""
     MISPLACED = 5
-    """The feet are farther from their place than `law.stance_max`, or were just moved: all hold."""
+    """Feet beyond `law.stance_max`, or just moved."""
     TRIPPED = 6
-    """A limit was exceeded (`PlannerStatus.trip`): all hold until all values are calm."""
+    """Tripped (`PlannerStatus.trip`), until every value is calm."""
     MISLOADED = 7
-    """The load is farther from the robot file than `law.load_correction`, or not yet weighed after
-    hanging on a hoist: all hold."""
+    """Load beyond `law.load_correction`, or not yet weighed after the hoist."""
     YIELDING = 8
-    """Another planner leads: this one sends no command that a module could use until it ends."""
+    """Another planner leads; this one sends no usable command until that one ends."""
     FALLEN = 9
-    """The robot has fallen: all are to go limp, until a person has re-armed them."""
+    """All only damp until a person re-arms them."""
 
 
 class HeatAction(IntEnum):
-    """What the planner does before a motor is too warm (docs/law.md#heat)."""
+    """Planner's action before a motor is too warm (docs/law.md#heat)."""
 
     NONE = 0
     EASES = 1
     """Assist ramps down to the weight that the wearer rests on the robot; the wearer is warned."""
     STANDS_UP = 2
-    """It stands up by itself; height and pitch are not the person's."""
+    """Stands up on its own; the wearer cannot lead height and pitch."""
     RESTS = 3
-    """It stays straight until it has cooled; height and pitch are not the person's."""
+    """Stays straight until cooled; the wearer cannot lead height and pitch."""
 
 
 class Park(IntEnum):
-    """What is asked of a robot that may park (docs/law.md#park); OPEN is a button."""
+    """Request to a robot that may park (docs/law.md#park); OPEN comes from a button."""
 
     AUTO = 0
     NEVER = 1
@@ -226,67 +221,66 @@ class Park(IntEnum):
 
 
 class Wearing(IntEnum):
-    """What the planner makes of the person (`services.planner.watch.park`)."""
+    """Planner's estimate of what the wearer does (`services.planner.watch.park`)."""
 
     LEADS = 0
-    """Height and pitch are the person's."""
+    """The wearer leads height and pitch."""
     RESTS = 1
-    """Parked: the assist follows what rests on the harness."""
+    """Parked: the assist follows the weight on the harness."""
     AWAY = 2
-    """Nobody touches the harness: closed."""
+    """Parked; nobody touches the harness."""
     PULLS = 3
-    """Somebody pulls along the floor; changes nothing."""
+    """Pull along the floor; no effect."""
     BUMPED = 4
-    """A blow too short to open it."""
+    """Parked; the bump was too short to open it."""
 
 
 class SplitSource(IntEnum):
     """Source of a tick's local gains (docs/law.md#gain-split)."""
 
     DIAGONAL = 0
-    """The paper's split, diag(K_q)."""
+    """The paper's diag(K_q)."""
     SCHEDULE = 1
-    """The certified schedule."""
+    """Certified schedule."""
     STIFFENED = 2
-    """Stiffer gains, because the schedule's did not meet the certificate."""
+    """Stiffer than the schedule, to meet the certificate."""
     UNCERTIFIED = 3
-    """None met the certificate: all hold."""
+    """No gains met the certificate: all hold."""
     CONTROLLER = 4
-    """Those of a controller of your own, certified."""
+    """Certified gains of your own controller."""
 
 
 class Tare(IntEnum):
     """Zero of the harness sensor."""
 
     RUNNING = 0
-    """The zero is being averaged; the harness must be unloaded and still."""
+    """Averaging; keep the harness unloaded and still."""
     UNSTEADY = 1
-    """As RUNNING, but the forces moved too much: averaging started over."""
+    """Averaging restarted: the forces moved too much."""
     DONE = 2
     """The zero is known."""
 
 
 class RunEventKind(IntEnum):
-    """Kind of an event of a run."""
+    """Kind of run event."""
 
     STARTED = 0
-    """The scenario started."""
+    """Scenario started."""
     KILLED = 1
-    """A service got a signal."""
+    """A service received a signal."""
     RESTARTED = 2
     """A service was started or continued."""
     PUSHED = 3
-    """A push began."""
     FINISHED = 4
-    """The scenario ended."""
+    """Scenario ended."""
     FAULTED = 5
-    """A drive's fault began; the subject is the module, the detail the kind."""
+    """Drive fault began; subject: module, detail: kind."""
     STALLED = 6
-    """The machine stalled until then; the detail says for how long."""
+    """Machine stall ended; detail: duration."""
 
 
 def name_of(kind: type[IntEnum], code: int) -> str:
-    """Return the name of a code, for example TRACK, or "unknown (99)": of another version."""
+    """Return the name of a code, such as TRACK, or "unknown (99)" for another version's code."""
     try:
         return kind(code).name
     except ValueError:
@@ -297,15 +291,15 @@ class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True,
     """Base of all messages: the sender's monotonic time and a sequence number."""
 
     t_ns: Int64
-    """Sender's monotonic time at which the content was true."""
+    """Sender's monotonic time of the content."""
     seq: Int64
-    """Sequence number: one more for each message of this sender on this key."""
+    """Sequence number on this key; counts up by 1."""
 
 
 class JointState(Message, frozen=True):
-    """One module as its joint service sees it. Published at the state rate.
+    """State of one module, published at the state rate.
 
-    `t_ns` is the stamp that the planner echoes in `JointCommand.echo_t_ns`.
+    The planner echoes `t_ns` in `JointCommand.echo_t_ns`.
     """
 
     q: Pair
@@ -313,127 +307,117 @@ class JointState(Message, frozen=True):
     v: Pair
     """Joint rates, rad/s."""
     tau: Pair
-    """Joint torques sent to the drive in this cycle, N m, after the limiter."""
+    """Joint torques sent to the drive, after the limiter, N m."""
     mode: Int64
-    """Mode of the service."""
     cause: Int64
-    """Cause of the last change of mode; 0 before the first."""
+    """Cause of the last mode change."""
     ready: bool
-    """True if commands have been fresh for long enough to track as soon as `hold` is lifted."""
+    """True if commands have been fresh long enough to track once `hold` is lifted."""
     age_ns: Int64
-    """Age of the newest command in use (docs/architecture.md#age-rule); -1 if there is none."""
+    """Age of the command in use (docs/architecture.md#age-rule); -1: no command."""
     session: Int64
-    """Session of the newest command in use; 0 if there is none."""
+    """Its session; 0: no command."""
     command_seq: Int64
-    """Sequence number of the newest command in use; -1 if there is none."""
+    """Its sequence number; -1: no command."""
     cycle: Int64
-    """Control cycles since the start."""
+    """Cycles since the start."""
     late: Int64
-    """Cycles that came later than twice the period after the one before."""
+    """Cycles over two periods after the previous one."""
     dropouts: Int64
-    """Recent drop-outs that lengthen the wait before TRACK."""
+    """Recent drop-outs; they lengthen the wait before TRACK."""
     refused: Int64
-    """Commands refused since the start, for any cause (`Refusal`)."""
+    """Commands refused since the start (`Refusal`)."""
     drive: Int64
-    """Status of the drive."""
     drive_error: Int64
-    """Error bits of both axes, or-ed; 0 if none."""
+    """Error bits of both axes, or-ed."""
     stiffened: bool = False
-    """True while this module holds with, or rises to, all of its support gains: another may be
-    limp."""
+    """True while gains are at, or rise to, the support gains."""
     outside: Int64 = 0
-    """Part of the newest command that lies outside the envelope; 0 if none."""
+    """Part of the newest command that is outside the envelope (`Outside`); 0 if none is."""
     state_phase: Int64 = 0
-    """Phase in which this module sends its states, as the planner asked (`JointCommand`)."""
+    """Phase of its states (`JointCommand`)."""
     refusal: Int64 = 0
-    """Cause of the newest refusal of a command, for a second; 0 if there was none."""
+    """Newest refusal within the last second."""
     refused_session: Int64 = 0
-    """Session of that command: of whom it came."""
+    """Session of that command."""
     celsius: Pair = (0.0, 0.0)
-    """Estimated temperature of both windings, C; 0 if it is not estimated."""
+    """Estimated winding temperatures, C; 0: not estimated."""
     heat_left_s: float = -1.0
-    """Seconds left at this load until a winding or an output stage is too warm; 3600: an hour or
-    more; -1: not estimated."""
+    """Time at this load until a winding or output stage is too warm, s; 3600: at least an hour; -1:
+    not estimated."""
     supply_v: float = 0.0
-    """Voltage of the drive's supply, V; 0: not known."""
+    """Drive's supply voltage, V; 0: unknown."""
 
 
 class JointCommand(Message, frozen=True):
     """References, local gains and torques for one module (docs/law.md#references-and-age)."""
 
     session: Int64
-    """Random number of this planner's life."""
+    """Random number of this planner session."""
     echo_t_ns: Int64
-    """The `t_ns` of this module's newest state: the age is measured on the module's clock."""
+    """`t_ns` of this module's newest state; gives the age on the module's clock."""
     hold: bool
-    """True asks for HOLD, so that no leg works against the other."""
+    """True requests HOLD, so that no leg works against the other."""
     q_ref: Pair
-    """Joint reference, rad."""
+    """Reference, rad."""
     v_ref: Pair
-    """Rate of the reference, rad/s."""
+    """Its rate, rad/s."""
     tau_ff: Pair
     """Feedforward torque, N m."""
     dtau_ff: Pair
-    """Rate of the feedforward torque, N m/s."""
+    """Its rate, N m/s."""
     tau_coupled: Pair
-    """Coupled torque, N m: stiffness and damping of the body beyond the local gains, and what bears
-    a lasting push, low-passed, plus the eased lead; dropped in HOLD."""
+    """Coupled torque, N m: body stiffness and damping beyond the local gains, and the push
+    integral, low-passed; plus the eased lead. Dropped in HOLD."""
     k_p: Pair
     """Local stiffness D, N m/rad."""
     k_d: Pair
     """Local damping D_B, N m s/rad."""
     margin: float
-    """Margin of the failsafe certificate for all six modules' gains: 1 is the stiffness required, 0
-    is a fall (docs/law.md#certificate)."""
+    """Static certificate's margin for all six modules: 1 is the required stiffness, 0 a fall
+    (docs/law.md#certificate)."""
     margin_onboard: float
-    """The same with the drives' own loops only."""
+    """Same for the drives' own loops."""
     stiffen: bool = False
-    """True while another module may be limp: in HOLD this one raises its gains to the stand
-    gains."""
+    """Another module may be limp: in HOLD, rise to the support gains."""
     state_phase: Int64 = 0
-    """The module is to send its state in the periods of this number, modulo the periods of a state
-    (docs/architecture.md#rates)."""
+    """Period in which to send the state (docs/architecture.md#rates)."""
     fallen: bool = False
-    """True once the robot has fallen: this module is to give up all stiffness."""
+    """True once fallen: drop all stiffness."""
 
 
 class JointEvent(Message, frozen=True):
     """A change of mode of a joint service."""
 
     mode_before: Int64
-    """Mode before the change."""
     mode_after: Int64
-    """Mode after the change."""
     cause: Int64
-    """Cause of the change."""
     age_ns: Int64
-    """Age of the newest command at the change; -1 if there was none."""
+    """Age of the newest command; -1: no command."""
     tau_before: Pair
-    """Torque of the last cycle before the change, N m."""
+    """Torque in the last cycle before the change, N m."""
     tau_after: Pair
-    """Torque of the first cycle after the change, N m."""
+    """Torque in the first cycle after it, N m."""
 
 
 class Wrench(Message, frozen=True):
     """Wrench of the operator on the torso, at the harness point.
 
-    Torso axes, because the sensor is fixed to the torso. The assist on the operator is the
-    opposite.
+    In torso axes, because the sensor is fixed to the torso. The assist on the operator has the
+    opposite sign.
     """
 
     force: Vector3
-    """Force, N, torso axes."""
+    """N, torso axes."""
     moment: Vector3
-    """Moment about the harness point, N m, torso axes."""
+    """About the harness point, N m, torso axes."""
     valid: bool
-    """False while the sensor is stale, saturated, frozen or without a zero: the numbers are the
-    last good ones."""
+    """False: stale, saturated, frozen or no zero; the values are the last good ones."""
     saturated: bool
-    """True while a leg of the sensor is at its limit."""
+    """A sensor leg is at its limit."""
     tare: Int64
-    """Zero of the sensor."""
     age_ns: Int64
-    """Age of the sensor's sample on the harness service's clock."""
+    """Age of the sample, harness service's clock."""
 
 
 class Attitude(Message, frozen=True):
@@ -442,156 +426,144 @@ class Attitude(Message, frozen=True):
     up: Vector3
     """Unit vector against gravity, torso axes."""
     rate: Vector3
-    """Angular velocity of the torso, rad/s, torso axes."""
+    """Angular velocity, rad/s, torso axes."""
     valid: bool
-    """False while the sensor is silent, frozen or reports no fix: the numbers are the last good
-    ones."""
+    """False: silent, frozen or no fix; the values are the last good ones."""
     age_ns: Int64
-    """Age of the sensor's sample on the IMU service's clock; -1 before the first."""
+    """Age of the sample, IMU service's clock; -1 before the first."""
 
 
 class TareRequest(Message, frozen=True):
-    """Asks the harness service for a new zero: the present wrench shall read as nothing."""
+    """Request for a new zero: the harness service makes the present wrench read zero."""
 
     source: str
-    """Name of the sender."""
 
 
 class ToolRoster(Message, frozen=True):
-    """The tools that are linked with the recorder, and what it finds wrong."""
+    """Tools that are linked with the recorder, and problems that it found."""
 
     tools: tuple[str, ...]
-    """Each as NAME.HOST.PID, as it names itself."""
+    """Each as NAME.HOST.PID."""
     trouble: tuple[str, ...] = ()
-    """What keeps it from recording, and what is wrong with its host's disk, a line each."""
+    """Faults of recording and of the host's disk, one line each."""
 
 
 class PlannerStatus(Message, frozen=True):
     """Inputs and decisions of one planner tick."""
 
     session: Int64
-    """Random number of this planner's life."""
+    """Random number of this planner session."""
     mode: Int64
-    """Mode of the planner."""
     hold: bool
-    """True if the commands of this tick ask for HOLD."""
+    """True if the commands request HOLD."""
     p: Vector6
     """Measured pose: COM x y z, m; torso roll, pitch, yaw, rad; world."""
     pdot: Vector6
-    """Rate of the pose."""
+    """Its rate."""
     p_ref: Vector6
-    """Reference of the pose."""
+    """Its reference."""
     closure: Vector6
-    """Left minus right leg's estimate of the torso's pose, m and rad, world."""
+    """Left minus right leg's estimate of the torso pose, m and rad, world."""
     assist_n: float
-    """Assist force in the feedforward, N."""
+    """Assist in the feedforward, N."""
     margin: float
-    """Margin of the failsafe certificate, as in the commands; 0 before the first tick."""
+    """As in the commands; 0 before the first tick."""
     margin_onboard: float
-    """The same with the drives' own loops only."""
+    """Same for the drives' own loops."""
     split: Int64
-    """Source of the local gains."""
     ik_iterations: Int64
-    """Steps of the inverse kinematics."""
+    """Inverse kinematics steps."""
     ik_residual: float
-    """Largest residual of the inverse kinematics, m or rad."""
+    """Largest residual, m or rad."""
     tick_us: float
-    """Duration of this tick, from reading the inputs to the last command put."""
+    """Tick duration, from reading inputs to sending the last command."""
     state_seq: Modules
-    """Sequence number of the state consumed from each module."""
+    """Sequence number of each module's state used."""
     wrench_seq: Int64
-    """Sequence number of the wrench consumed; -1: none yet."""
+    """Sequence number of the wrench used; -1: none yet."""
     assist_requested_n: float
-    """Assist requested by the operator, N."""
+    """Operator's request, N."""
     state_age_ns: Modules
-    """Time since each module's newest state arrived, on the planner's clock; -1 if none yet."""
+    """Time since each module's newest state arrived; -1: none yet."""
     wait_s: float = 0.0
-    """Time until it may lead again after drop-outs, s; 0 if it does not wait."""
+    """Remaining wait after drop-outs, s."""
     attitude_seq: Int64 = -1
-    """Sequence number of the attitude consumed; -1: none yet."""
+    """Sequence number of the attitude used; -1: none yet."""
     slope: Pair = (0.0, 0.0)
-    """Rise of the floor along x and y in the law, rad."""
+    """Floor slope along x and y, rad."""
     shift_requested: Vector4 = STRAIGHT
-    """Shift requested by the operator: x, y, m; roll, yaw, rad."""
+    """Requested shift: x, y, m; roll, yaw, rad."""
     stance: Vector6 = AS_CONFIGURED
-    """Place of the right foot relative to the left, as deviation from the robot file: x, y, z, m,
-    and a rotation vector, rad, world axes."""
+    """Right foot relative to the left, as deviation from the robot file: x, y, z, m; rotation
+    vector, rad, world."""
     why: str = ""
-    """Why it does not lead, where the mode does not say it all; a supply's fault comes first."""
+    """Why it does not lead, beyond the mode; a supply fault comes first."""
     trip: Int64 = 0
-    """Trip for which it does not lead."""
     load: Vector3 = (0.0, 0.0, 0.0)
-    """Load beyond the robot file: kg, and moments a and b about pitch, N m
+    """Load beyond the robot file: kg; moments a and b about pitch, N m
     (`services.planner.law.load`)."""
     requested_by: str = ""
-    """Source of the intent in use; empty: none, or it is stale."""
+    """Source of the intent in use; empty: none or stale."""
     refused: Int64 = 0
-    """States, wrenches and attitudes refused so far: no sensor can have measured them."""
+    """Implausible states, wrenches and attitudes so far."""
     sit: bool = False
-    """True while it is asked to go down by itself (`OperatorIntent.sit`)."""
+    """`OperatorIntent.sit` in use."""
     heat: Int64 = 0
-    """What is done before a motor is too warm."""
     heat_left_s: float = -1.0
-    """Least of the modules' seconds left at this load; 3600: an hour or more; -1: not estimated."""
+    """Smallest `heat_left_s` of the modules."""
     supply_v: float = 0.0
-    """Lowest voltage of the drives' supplies, V, low-passed; 0: not known."""
+    """Lowest drive supply, V, low-passed; 0: unknown."""
     carried_n: float = 0.0
-    """Payload and person that it carries, N (docs/law.md#wearer); without a harness the payload."""
+    """Payload and person carried, N (docs/law.md#wearer); without a harness, the payload."""
     wearer: Int64 = 0
-    """What the planner makes of the person; 0 where it may not park."""
+    """0 if the robot may not park."""
     park_requested: Int64 = 0
-    """What the person asks of a robot that may park."""
 
 
 class OperatorIntent(Message, frozen=True):
-    """Requests of the person beyond leading by hand."""
+    """Person's requests beyond leading by hand."""
 
     assist_n: float
     """Requested upward force at the harness, N."""
     shift: Vector4 = STRAIGHT
-    """Requested offset from a straight stand: COM x and y, m; torso's roll and yaw, rad."""
+    """Offset from a straight stand: COM x and y, m; torso roll and yaw, rad."""
     source: str = ""
-    """Name of the sender."""
     sit: bool = False
-    """The robot is to go down by itself to its lowest pose, and hold there (`xrl down`)."""
+    """Go down to the lowest pose and hold there (`xrl down`)."""
     park: Int64 = 0
-    """What is asked of a robot that may park."""
 
 
 class HandLead(Message, frozen=True):
-    """Where a person leads the simulated hand in place of the scenario, and how they push."""
+    """Lead and push of a person in place of the scenario's simulated hand."""
 
     leads: bool
-    """False: height and pitch are not used; only the push is."""
+    """False: only the push counts."""
     height: float
     """Torso origin above the ankles, m."""
     pitch: float
-    """Pitch of the torso, rad."""
+    """Torso pitch, rad."""
     push: Vector3
-    """Push on the torso, N, world; it ends 0.3 s after the last message."""
+    """Push on the torso, N, world; ends 0.3 s after the last message."""
     source: str = ""
-    """Name of the sender."""
 
 
 class Estop(Message, frozen=True):
     """Emergency stop: every module goes to DAMP; only a restart leaves it."""
 
     source: str
-    """Name of the sender."""
 
 
 class SimControl(Message, frozen=True):
     """Command of a tool to the simulated world."""
 
     start: bool
-    """Start the scenario: its time becomes zero."""
+    """Start the scenario at time 0."""
 
 
 class RunEvent(Message, frozen=True):
     """An action of a tool on the run, for the log and the verdict."""
 
     kind: Int64
-    """Kind of the event."""
     subject: str
     """Service or push."""
     detail: str

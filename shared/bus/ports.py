@@ -1,7 +1,7 @@
-"""What a service's loop takes from the bus and puts on it, wherever it runs.
+"""Inboxes and outboxes of a service's loop, wherever it runs.
 
-Live these are `Latest` and `Publisher` of `shared.bus.session`; in lockstep modelled links, in
-re-execution what the log has.
+Live they are `Latest` and `Publisher` of `shared.bus.session`, in lockstep modelled links, in
+re-execution the log's messages.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ class Inbox(Protocol[M_co]):
 
 
 class CountingInbox(Inbox[M_co], Protocol[M_co]):
-    """An inbox that counts what came and was no message."""
+    """Inbox that counts payloads that are not messages."""
 
     @property
     def refused(self) -> int:
-        """Payloads so far that were none."""
+        """Payloads so far that were not messages."""
 
 
 class Outbox(Protocol[M_contra]):
     """Messages of one key."""
 
     def put(self, message: M_contra, /) -> bool:
-        """Send without waiting; False if it could not be sent."""
+        """Send without waiting; return False if it could not be sent."""

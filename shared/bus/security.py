@@ -1,14 +1,14 @@
-"""Who gets onto the bus, and what each may put and receive there (docs/security.md).
+"""Access to the bus, and what each peer may put and receive there (docs/security.md).
 
 Zenoh's settings for each `bus.security.mode`, and what `mtls` adds. Each process checks what its
 peers send by the name in their certificate: service and generation. The rules follow from the
-topics' columns `writers` and `readers`; what no rule allows is denied. Zenoh has no list of revoked
-certificates: the rules name the current generation of each name only.
+topics' columns `writers` and `readers`; everything else is denied. Zenoh has no list of revoked
+certificates, so the rules contain only the current generation of each name.
 
-Services of one host are linked by UNIX sockets: a TLS listener of Zenoh reports ten failed
-handshakes a second and keeps the sockets of all others until then, so whoever may connect to its
-port can keep new links off. A socket in the run directory is this user's alone; a peer on it may do
-what any of the keys here allows, because its user reads them.
+Services of one host are linked by UNIX sockets. A TLS listener of Zenoh reports ten failed
+handshakes a second and keeps the sockets of all others until then, so anyone who reaches its port
+can block new links. Only this user can open a socket in the run directory. A peer on it may do what
+any of the keys here allows, because its user can read them.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ UNIX: Final = "unixsock-stream/"
 TCP: Final = ("tcp/", "tls/")
 
 MESSAGE_MAX: Final = 1 << 20
-"""Largest message that is put together from its fragments, bytes."""
+"""Maximum message that is assembled from its fragments, bytes."""
 PAYLOAD_MAX: Final = 1 << 16
-"""Largest payload that is let in, bytes; the largest of the topics is a third of it."""
+"""Maximum accepted payload, bytes; the largest of the topics is a third of it."""
 HANDSHAKE_MS: Final = 2_000
-"""Longest TLS handshake that a listener waits for; Zenoh's own limit is 10 s."""
+"""Timeout of a TLS handshake at a listener; Zenoh's own is 10 s."""
 SESSIONS_MAX: Final = 128
-"""Peers at a time, of all names together: viewers that hang are not to shut a planner out."""
+"""Maximum number of peers, all names together; hung viewers must not shut a planner out."""
 
 _LOW_PASS: Final[dict[str, Any]] = {
     "id": "payloads",
@@ -53,17 +53,17 @@ _QUERIES: Final = ("liveliness_query", "declare_liveliness_subscriber")
 
 
 def settings(robot: RobotConfig, process: str, endpoints: Sequence[str]) -> dict[str, object]:
-    """Return Zenoh's settings that keep strangers off.
+    """Return Zenoh's access settings.
 
     `endpoints` are all that the process listens on or dials, as Zenoh takes them. Raises BusError
-    if one is none of the mode's, or a key is missing.
+    if an endpoint does not fit the mode, or a key is missing.
     """
     mode = robot.bus.security.mode
     right_ones = ENDPOINTS_OF_MODE[mode] + ((UNIX,) if mode == "mtls" else ())
     for endpoint in endpoints:
         if not endpoint.startswith(right_ones):
             right = " or ".join(f"{start}..." for start in ENDPOINTS_OF_MODE[mode])
-            raise BusError(f"{endpoint}: not under bus.security.mode = {mode!r}; {right} is right")
+            raise BusError(f"{endpoint}: not allowed if bus.security.mode = {mode!r}; use {right}")
     found: dict[str, object] = {
         "transport/unicast/max_sessions": SESSIONS_MAX,
         "transport/link/rx/max_message_size": MESSAGE_MAX,
@@ -88,7 +88,7 @@ def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
             "connect_private_key": key,
             "enable_mtls": True,
             "verify_name_on_connect": True,
-            # An expiry must not cut a robot that stands; `xrl doctor` warns before.
+            # An expiry must not cut off a standing robot; `xrl doctor` warns before it.
             "close_link_on_expiration": False,
         },
         "access_control": access_control(robot.name, own.name, own.generations, held),
@@ -96,13 +96,13 @@ def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
 
 
 def listener(endpoint: str) -> str:
-    """Return an endpoint to listen on as Zenoh takes it: a silent handshake is dropped soon."""
+    """Return a listening endpoint in Zenoh's form, with the timeout of its handshake."""
     of_tls = endpoint.startswith("tls/")
     return f"{endpoint}#tls_handshake_timeout_ms={HANDSHAKE_MS}" if of_tls else endpoint
 
 
 def limit_queues(robot: RobotConfig, listening: Sequence[str]) -> None:
-    """Under `mtls`, let this process's ports accept one waiting connection at a time."""
+    """Under `mtls`, limit this process's ports to one waiting connection at a time."""
     if robot.bus.security.mode == "mtls":
         ports = {host_and_port(each)[1] for each in listening if each.startswith(TCP)}
         sockets.shorten_queues(ports)
@@ -131,7 +131,7 @@ def access_control(
     policies, here = [], set(everybody)
     for name, generation in generations.items():
         own_rules = [
-            # By receiver: until a new peer has told its subscriptions, Zenoh sends it everything.
+            # By receiver: Zenoh sends a new peer everything until it knows its subscriptions.
             _rule(f"to-{name}", "egress", ("put",), topics.keys_between(robot, own, name)),
             _rule(f"{name}-puts", "ingress", ("put",), topics.written_keys(robot, name)),
             _rule(f"{name}-subscribes", "ingress", _RECEIVED, topics.read_keys(robot, name)),
@@ -157,7 +157,7 @@ def access_control(
 def _rule(
     name: str, flow: str, messages: Iterable[str], keys: tuple[str, ...]
 ) -> dict[str, Any] | None:
-    """Return a rule; None where there is nothing to allow, which Zenoh refuses as a rule."""
+    """Return a rule, or None without keys: Zenoh refuses an empty rule."""
     if not keys:
         return None
     return {
@@ -175,12 +175,12 @@ def common_name(name: str, generation: int) -> str:
 
 
 def alive_prefix(robot: str) -> str:
-    """Return what the keys of the liveliness tokens begin with."""
+    """Return the prefix of the liveliness tokens' keys."""
     return f"xrl/{robot}/alive"
 
 
 def tools_prefix(robot: str) -> str:
-    """Return what the keys of the tools' liveliness tokens begin with."""
+    """Return the key prefix of the liveliness tokens of all tools."""
     return f"{alive_prefix(robot)}/tool"
 
 
@@ -201,9 +201,9 @@ def _token_keys(robot: str, name: str) -> tuple[str, ...]:
 
 
 def services_here(robot: RobotConfig) -> frozenset[str]:
-    """Return the services that run on this host: their keys are here, and their address is its own.
+    """Return the services of this host: it holds their keys, and their address is its own.
 
-    None unless the bus is `mtls`, or where this host has no keys. A name lookup may block: at the
+    Empty unless the bus is `mtls` and this host has keys. A name lookup may block: call it at the
     start only.
     """
     if robot.bus.security.mode != "mtls":
@@ -211,20 +211,20 @@ def services_here(robot: RobotConfig) -> frozenset[str]:
     try:
         held = held_names(keys_folder(robot))
     except BusError:
-        return frozenset()  # `open_session` refuses to go on without them
+        return frozenset()  # `open_session` raises without them
     return frozenset(s for s in robot.services if s in held and _is_own(robot.bus.endpoints[s]))
 
 
 def endpoint_here(robot: RobotConfig, service: str, here: frozenset[str]) -> str:
-    """Return where a process of this host, with these `services_here`, reaches a service."""
+    """Return a service's endpoint for a process of this host, with these `services_here`."""
     return _SOCKET.format(service=service) if service in here else robot.bus.endpoints[service]
 
 
 def listening(robot: RobotConfig, service: str, here: frozenset[str]) -> tuple[str, ...]:
-    """Return where a service here listens; at a port only if another host may link to it."""
+    """Return the endpoints of a service here; with a port only if another host may link to it."""
     own = endpoint_here(robot, service, here)
     public = robot.bus.endpoints[service]
-    # The simulator runs where the fleet starts it; a real robot's hosts have no key of it.
+    # The simulator runs where the fleet starts it; a real robot's hosts have no key for it.
     others = set(robot.services) - here - {"simulator"}
     return (own, public) if own != public and (others or robot.bus.security.allow) else (own,)
 
@@ -235,9 +235,9 @@ def _is_own(endpoint: str) -> bool:
 
 
 def _is_own_address(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
-    """Ask for the route: to an own address it begins there.
+    """Return True if the route to an address begins at that address.
 
-    Binding would not tell: with `net.ipv4.ip_nonlocal_bind` any address can be bound.
+    Binding proves nothing: with `net.ipv4.ip_nonlocal_bind` any address can be bound.
     """
     if address.is_loopback:
         return True

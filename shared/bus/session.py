@@ -1,13 +1,12 @@
 """The bus: publishers, subscribers and the links between processes (docs/networks.md).
 
-The only file that knows Zenoh, beside the gateway's session with ROS 2. Every service is a peer
-with a fixed endpoint. There is no router, no scouting and no gossip, and a peer forwards nothing:
-each pair of services has a link of its own, but for two joint services, and a tool has one with
-each service (`peers_of`).
+Only this file and the gateway's session with ROS 2 use Zenoh. Every service is a peer with a fixed
+endpoint. There is no router, no scouting and no gossip, and a peer forwards nothing. So each pair
+of services has its own link, except two joint services, and a tool links with each service
+(`peers_of`).
 
 On the control path (`Publisher.put`, `Latest.take`) nothing blocks or raises. A message that cannot
-be sent or decoded is counted, and its absence shows as age. RUST_LOG=info shows Zenoh's own
-log.
+be sent or decoded is counted, and its absence shows as age. RUST_LOG=info shows Zenoh's own log.
 """
 
 from __future__ import annotations
@@ -55,10 +54,10 @@ _SETTINGS: Final[dict[str, object]] = {
     "scouting/gossip/enabled": False,
     "listen/timeout_ms": 0,
     "listen/exit_on_failure": True,
-    # -1 with exit_on_failure off dials in the background for ever; 0 would dial once only.
+    # -1 with exit_on_failure off dials in the background forever; 0 would dial once only.
     "connect/timeout_ms": -1,
     "connect/exit_on_failure": False,
-    # One object: Zenoh knows no key for its parts.
+    # One object: Zenoh has no keys for its parts.
     "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2.0},
     # Else open() waits half a second for peers that are not up.
     "open/return_conditions/connect_scouted": False,
@@ -81,23 +80,23 @@ _PRIORITIES: Final = {
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
 _BATCH_MAX: Final = 64
-"""Messages in a batch, if none of them closes it."""
+"""Maximum number of messages in a batch that no message closes."""
 _RECORDING_WAITS_S: Final = 16.0
-"""Messages that may wait while the disk is slow, s at their rate: 60 MB of the fleet."""
+"""Capacity for messages that wait for a slow disk, s at their rate: 60 MB for the fleet."""
 _ALIVE_TIMEOUT_S: Final = 0.2
 _TOOLS_MAX: Final = 128
-"""Tools that are named: as many as there may be links."""
+"""Maximum number of named tools, equal to the maximum number of links."""
 _TOOLS_WAITING: Final = 4096
-"""Comings and goings of tools that wait to be taken; of more the oldest are lost."""
+"""Capacity for arrivals and departures of tools; the oldest are dropped."""
 _TOOLS_AT_ONCE: Final = 64
 
 
 def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
-    """Return which of a fleet's services a process dials; it is dialled by all others it talks to.
+    """Return the services that a process dials; all its other peers dial it.
 
-    Each pair is linked once. Joint services dial nobody: they have nothing to say to one
-    another, and the tier that must outlive the others spends no time on absent ones. The
-    other services dial the joints and those before them in `services`; a tool dials all.
+    Each pair is linked once. Joint services dial nobody: they exchange nothing with each other, and
+    the tier that must outlive the others spends no time on absent peers. Each other service dials
+    the joints and the services before it in `services`; a tool dials all.
     """
     if name in MODULES:
         return ()
@@ -108,10 +107,10 @@ def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
 
 
 class _BatchSender:
-    """Puts what a service publishes once more, for the recorder, many messages at a time.
+    """Second copy of a service's messages for the recorder, many messages at a time.
 
-    A recorder that subscribed to each key would be woken for each message, and so would Zenoh's
-    thread at both ends.
+    If the recorder subscribed to each key, each message would wake it, and Zenoh's thread at both
+    ends.
     """
 
     def __init__(self, put: _Put) -> None:
@@ -122,7 +121,7 @@ class _BatchSender:
     def also(self, key: str, put: _Put, *, closes: bool) -> _Put:
         """Return a `put` of one key that also adds the payload to the batch.
 
-        The batch leaves with a payload that closes it.
+        A payload that closes the batch sends it.
         """
         messages = self._messages
 
@@ -135,7 +134,7 @@ class _BatchSender:
         return put_and_add
 
     def send(self) -> None:
-        """Put what has been gathered, if there is anything."""
+        """Send the collected messages, if any."""
         if self._messages:
             self._seq += 1
             batch = Batch(t_ns=now_ns(), seq=self._seq, messages=tuple(self._messages))
@@ -144,7 +143,7 @@ class _BatchSender:
 
 
 class Publisher(Generic[T]):
-    """Puts the messages of one key on the bus."""
+    """Publisher of one key."""
 
     def __init__(
         self, publisher: zenoh.Publisher, encoded: Callable[[T], bytes], put: _Put | None = None
@@ -157,10 +156,9 @@ class Publisher(Generic[T]):
     def put(self, message: T) -> bool:
         """Send a message; return False and count it if it cannot be sent.
 
-        Never blocks and never raises. Where a subscriber's queue is full the message is
-        dropped for that subscriber only, and that is not counted. The first message that cannot be
-        encoded is a bug of the sender; a thread logs it with its field, because a log line may
-        block.
+        Never blocks and never raises. If a subscriber's queue is full, the message is dropped for
+        that subscriber only and not counted. A message that cannot be encoded is a bug of the
+        sender. A thread logs the first one with its field, because a log line may block.
         """
         try:
             self._put(self._encoded(message))
@@ -178,14 +176,14 @@ class Publisher(Generic[T]):
 
 
 class RawPublisher(Publisher[bytes]):
-    """Puts payloads on one key as they are: for a player of logs, never for a service."""
+    """Publisher of encoded payloads on one key: for log playback, never for a service."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         super().__init__(publisher, bytes)
 
     @property
     def matched(self) -> bool:
-        """True if somebody subscribes to the key; for display."""
+        """True if the key has a subscriber; for display."""
         try:
             return bool(self._publisher.matching_status.matching)  # type: ignore[attr-defined]  # zenoh's stub
         except zenoh.ZError:
@@ -193,7 +191,7 @@ class RawPublisher(Publisher[bytes]):
 
 
 class Latest(Generic[M]):
-    """Holds the newest message of one key."""
+    """Newest message of one key."""
 
     def __init__(self, subscriber: _Subscriber, message_type: type[M]) -> None:
         self._subscriber = subscriber  # dropping it would end the subscription
@@ -202,7 +200,7 @@ class Latest(Generic[M]):
 
     @property
     def refused(self) -> int:
-        """Payloads that were no message of this type, or held a number that is not finite."""
+        """Payloads that were not a message of this type, or held a number that is not finite."""
         return self._decoder.refused
 
     def take(self) -> M | None:
@@ -217,7 +215,7 @@ class Latest(Generic[M]):
 
 
 class LatestInBatch(Latest[M]):
-    """Holds the newest message of one key, out of the batches for the recorder."""
+    """Newest message of one key, from the recorder's batches."""
 
     def __init__(self, batches: _Subscriber, key: str, message_type: type[M]) -> None:
         super().__init__(batches, message_type)
@@ -234,7 +232,7 @@ class LatestInBatch(Latest[M]):
 
 
 class Stream:
-    """Every sample of some keys, undecoded: for the recorder and for tools."""
+    """Undecoded samples of some keys, for the recorder and for tools."""
 
     def __init__(self, subscribers: Sequence[_Subscriber]) -> None:
         self._subscribers = deque(subscribers)
@@ -242,9 +240,9 @@ class Stream:
     def take(self) -> tuple[str, bytes, int] | None:
         """Return (key, payload, time in monotonic ns) of the oldest sample, or None.
 
-        The time is that of this call, not of the arrival. Order holds within one key
-        expression. Never blocks; when the buffer is full the oldest samples are lost,
-        which the sequence numbers of the messages show.
+        The time is that of this call, not of the arrival. Order holds within one key expression.
+        Never blocks. A full buffer drops its oldest samples; the messages' sequence numbers show
+        the loss.
         """
         for _ in range(len(self._subscribers)):
             self._subscribers.rotate(-1)  # in turns, so that no busy key starves another
@@ -255,12 +253,12 @@ class Stream:
 
 
 class Recording(Stream):
-    """Every message that is recorded, undecoded, out of its batch."""
+    """Undecoded recorded messages, taken out of their batches."""
 
     def __init__(
         self, subscribers: Sequence[_Subscriber], keys_by_batch: Mapping[str, Container[str]]
     ) -> None:
-        """Take the subscribers, and the keys that may be in the batches of each batch's key."""
+        """Take the subscribers and, by batch key, the keys that its batches may contain."""
         super().__init__(subscribers)
         self._keys_by_batch = keys_by_batch
         self._decoder = Decoder(Batch)
@@ -269,7 +267,7 @@ class Recording(Stream):
     def take(self) -> tuple[str, bytes, int] | None:
         """Return (key, payload, time in monotonic ns) of the oldest message, or None.
 
-        A message whose sender may not put it is left out of its batch; a malformed batch comes as
+        A message that the batch's sender may not put is dropped. A malformed batch is returned as
         it is, and the recorder counts its key as unknown.
         """
         while not self._waiting:
@@ -290,7 +288,7 @@ def place_of_tool() -> str:
 
 
 class LinkedTools:
-    """The tools that are linked with this process, by the names that they give themselves."""
+    """Tools linked with this process, by the names that they chose."""
 
     def __init__(self, subscriber: _Subscriber) -> None:
         self._subscriber = subscriber
@@ -322,7 +320,7 @@ class Session:
         self._alive_prefix = f"{alive_prefix(robot)}/"
         self._batches: dict[str, _BatchSender] = {}
         self._token = session.liveliness().declare_token(token_key(robot, name, place_of_tool()))
-        if over_tcp:  # held, or it would end
+        if over_tcp:  # the reference keeps it alive
             self._links = session.info.declare_link_events_listener(self._meet, history=True)
 
     def __enter__(self) -> Self:
@@ -334,7 +332,7 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Leave the bus: all publishers and subscribers end, the socket file goes away.
+        """Leave the bus: end all publishers and subscribers, and remove the socket file.
 
         Takes up to one lease if a peer is stopped; never raises.
         """
@@ -371,9 +369,9 @@ class Session:
     def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
         """Declare a publisher of encoded payloads on any full key; BusError if it is malformed.
 
-        All such publishers have one priority: payloads arrive in the order of `put`, over all keys.
-        With `patient` the `put` waits for a slow subscriber, up to `wait_before_close` (5 s), and
-        then drops the link instead of the message: only for a caller that nothing waits for.
+        All such publishers have the same priority, so payloads arrive in the order of `put`, over
+        all keys. With `patient`, `put` waits up to `wait_before_close` (5 s) for a slow subscriber,
+        and then drops the link instead of the message. Use it only if nothing waits for the caller.
         """
         control = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
         try:
@@ -381,29 +379,29 @@ class Session:
                 key, congestion_control=control, priority=_PRIORITIES[Priority.DATA], express=False
             )
         except zenoh.ZError as error:
-            raise BusError(f"{key}: {_reason(error)}; a key of the bus is right") from None
+            raise BusError(f"{key}: {_reason(error)}; use a valid key") from None
         return RawPublisher(publisher)
 
     def latest(self, topic: Topic, message_type: type[M], module: str = "") -> Latest[M]:
-        """Declare a subscriber that keeps the newest message only; as `publisher`."""
+        """Declare a subscriber that keeps only the newest message; arguments as for `publisher`."""
         key = self._key(topic, message_type, module)
         return Latest(_ring(self._session, key, 1), message_type)
 
     def latest_in_batch(
         self, topic: Topic, message_type: type[M], module: str = ""
     ) -> LatestInBatch[M]:
-        """As `latest`, out of the recorder's batches: showing it costs the service nothing."""
+        """Declare the same on the recorder's batches, which costs the service nothing."""
         key = self._key(topic, message_type, module)
         if topic.batch is None:
-            raise BusError(f"{topic.name}: is in no batch; use `latest`")
+            raise BusError(f"{topic.name}: is not in a batch; use `latest`")
         batches = _ring(self._session, topic.batch.key(self.robot, module), 1)
         return LatestInBatch(batches, key, message_type)
 
     def stream(self, key_expressions: Sequence[str], capacity: int = 65536) -> Stream:
         """Declare a subscriber that keeps every sample, up to `capacity` per expression.
 
-        Expressions are full keys, or with wildcards such as `xrl/lab/joint/*/state`; a key that
-        fits two of them comes twice. Raises BusError for a malformed one.
+        Expressions are full keys, or with wildcards such as `xrl/lab/joint/*/state`. A key that
+        matches two of them arrives twice. Raises BusError for a malformed one.
         """
         try:
             return Stream([_ring(self._session, key, capacity) for key in key_expressions])
@@ -411,7 +409,7 @@ class Session:
             raise BusError(f"{', '.join(key_expressions)}: {_reason(error)}") from None
 
     def recording(self) -> Recording:
-        """Declare subscribers of all that is recorded."""
+        """Declare subscribers for everything that is recorded."""
         in_batches, every = topics.keys_by_batch(self.robot), topics.all_keys(self.robot)
         keys = [k for k, t in every.items() if k in in_batches or (t.recorded and not t.batch)]
         waiting = [max(1000, round(_RECORDING_WAITS_S * every[key].rate_hz)) for key in keys]
@@ -421,10 +419,10 @@ class Session:
         )
 
     def alive(self) -> set[str]:
-        """Return the services that this process has a link with, and itself if it is one.
+        """Return the services linked with this process, and itself if it is a service.
 
-        For display only: a stopped process counts as alive until its lease is over.
-        Takes up to 0.2 s; not for a control loop.
+        For display only: a stopped process counts as alive until its lease is over. Takes up to
+        0.2 s; not for a control loop.
         """
         replies = self._session.liveliness().get(self._alive_prefix + "*", timeout=_ALIVE_TIMEOUT_S)
         return {
@@ -444,7 +442,7 @@ class Session:
 
     @staticmethod
     def _meet(event: zenoh.LinkEvent) -> None:
-        """Have a TCP link closed by a reset.
+        """Make a TCP link close by a reset.
 
         Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut for
         longer than the lease, all links stalled for up to 10 s for each lost link.
@@ -456,12 +454,14 @@ class Session:
     def _key(self, topic: Topic, message_type: type[Message], module: str) -> str:
         if message_type is not topic.type:
             right = topic.type.__name__
-            raise BusError(f"{topic.name}: {message_type.__name__} is not its type; use {right}")
+            raise BusError(
+                f"{topic.name}: {message_type.__name__} is not its message type; use {right}"
+            )
         if topic.per_module and module not in MODULES:
             right = ", ".join(MODULES)
-            raise BusError(f"{topic.name}: {module!r} is no module; use one of {right}")
+            raise BusError(f"{topic.name}: {module!r} is not a valid module; use one of {right}")
         if module and not topic.per_module:
-            raise BusError(f"{topic.name}: has no key for {module}; leave the module out")
+            raise BusError(f"{topic.name}: has no key for {module}; omit the module")
         return topic.key(self.robot, module)
 
 
@@ -478,27 +478,27 @@ def open_session(
     """Join the bus and return at once; links form as peers come up.
 
     Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the priority of the
-    process before: Zenoh's thread inherits it. From then on the process uses the clock of the fleet
-    in `run_dir` (`shared.clock.keep_pace`). The socket that a killed process left behind is no
+    process first: Zenoh's thread inherits it. From this call on, the process uses the clock of the
+    fleet in `run_dir` (`shared.clock.keep_pace`). A socket left behind by a killed process is no
     obstacle.
 
     Args:
         config: the robot; `config.bus` holds the endpoints and the lease.
         name: a service of `robot_config.SERVICES`, which listens on its endpoint, or any other
             name (letters, digits, _ and -) for a tool, which listens nowhere.
-        run_dir: replaces `{run}` in endpoints; made if it is not there.
-        listen: further endpoints to listen on: with them a tool serves other tools.
+        run_dir: replaces `{run}` in endpoints; created if missing.
+        listen: further endpoints to listen on, by which a tool serves other tools.
         connect: further endpoints to dial: those of such a tool.
-        only: services to dial; None: all that this process talks to.
+        only: services to dial; None: all peers of this process.
         injected: dial through the network proxy on the links that it serves
             (`shared.links.PAIRS`).
 
     Raises:
-        BusError: the name cannot be used, or the endpoint is taken, too long or not possible.
+        BusError: the name is not allowed, or the endpoint is in use, too long or invalid.
     """
     keep_pace(run_dir)
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
-        raise BusError(f"{name!r} is no name for a process; use letters, digits, _ and - only")
+        raise BusError(f"{name!r} is not a valid process name; use letters, digits, _ and - only")
     here = security.services_here(config)
     own = security.listening(config, name, here) if name in SERVICES else ()
     peers = [peer for peer in peers_of(name, config.services) if only is None or peer in only]
@@ -514,7 +514,7 @@ def open_session(
         **_SETTINGS,
         **security.settings(config, name, (*listening, *dialling)),
         "transport/link/tx/lease": config.bus.lease_ms,
-        # A stopped process takes a call but never answers; close() waits for that answer.
+        # A stopped process accepts a link but never answers; close() waits for that answer.
         "transport/unicast/open_timeout": config.bus.lease_ms,
         "transport/unicast/accept_timeout": config.bus.lease_ms,
         "listen/endpoints": [security.listener(endpoint) for endpoint in listening],
@@ -543,22 +543,22 @@ def open_session(
 
 
 def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
-    """Subscribe without a callback: a full ring drops its oldest and holds up no other key."""
+    """Subscribe without a callback: a full ring drops its oldest and delays no other key."""
     return session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
 
 
 def _endpoint(text: str, run_dir: Path) -> str:
-    """Return an endpoint with `{run}` filled in; one that there cannot be is refused."""
+    """Return an endpoint with `{run}` filled in; BusError if it is invalid."""
     endpoint = expand(text, run_dir)
     if endpoint.startswith(security.TCP):
         host_and_port(endpoint)
     elif not is_endpoint(endpoint):
-        raise BusError(f"{endpoint}: no socket path with ? or #; choose another directory")
+        raise BusError(f"{endpoint}: a socket path must not contain ? or #; use another directory")
     length = len(os.fsencode(endpoint.removeprefix(security.UNIX)))
     if endpoint.startswith(security.UNIX) and length > SOCKET_PATH_MAX:
         raise BusError(
-            f"{endpoint}: a socket path of {length} bytes; "
-            f"at most {SOCKET_PATH_MAX}: take a shorter run directory"
+            f"{endpoint}: the socket path has {length} bytes, "
+            f"but at most {SOCKET_PATH_MAX} are possible; choose a shorter run directory"
         )
     return endpoint
 
@@ -571,17 +571,17 @@ def _make_directory(endpoint: str) -> None:
 
 
 def _open_error(name: str, listen: Sequence[str], error: Exception) -> BusError:
-    """Say in one line why a session could not be opened, and what would be right."""
+    """Return a one-line error: why a session could not be opened, and the remedy."""
     where = ", ".join(listen) or "bus"
     reason = _reason(error)
     # EAGAIN is the lock that Zenoh holds beside a UNIX socket while it listens there.
     if "EAGAIN" in reason or "Address already in use" in reason:
         if dead := [endpoint for endpoint in listen if _is_dead(endpoint)]:
             right = "find out why (`dmesg`): its disk may be read-only"
-            return BusError(f"{dead[0]}: a dead socket that cannot be removed; {right}")
-        right = f"stop the {name} that runs already, or take another run directory"
+            return BusError(f"{dead[0]}: this dead socket cannot be removed; {right}")
+        right = f"stop the {name} that is already running, or choose another run directory"
         return BusError(f"{where}: in use; {right}")
-    return BusError(f"{where}: {name} cannot listen: {reason}; an endpoint it may use is needed")
+    return BusError(f"{where}: {name} cannot listen: {reason}; choose another endpoint")
 
 
 def _is_dead(endpoint: str) -> bool:
@@ -594,5 +594,5 @@ def _is_dead(endpoint: str) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """Return an error's text without the place in Zenoh's source that it ends with."""
+    """Return an error's text without the location in Zenoh's source at its end."""
     return str(error).partition(" at /")[0]

@@ -1,9 +1,9 @@
-"""TCP sockets of this process and this host, by the kernel (Linux): Zenoh keeps its own to itself.
+"""TCP sockets of this process and host, from the kernel (Linux): Zenoh does not expose its own.
 
 A TLS listener of Zenoh sleeps for 100 ms after each failed handshake. It also accepts all
-connections that wait meanwhile, each with a descriptor: 640 bad connections a second left 4700
-open in a minute. With a queue of one it accepts no more than it ends. Which addresses reach the
-ports at all is for the firewall (`deploy/nftables`).
+connections that wait meanwhile, each with a descriptor: 640 bad connections a second left 4700 open
+in a minute. With a queue of one it accepts no more than it ends. The firewall decides which
+addresses reach the ports at all (`deploy/nftables`).
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ _RESET: Final = struct.pack("ii", 1, 0)
 
 
 def shorten_queues(ports: Collection[int]) -> None:
-    """Let this process's listeners at these ports accept one waiting connection at a time."""
+    """Limit this process's listeners at these ports to one waiting connection at a time."""
     for own in _own_sockets():
         if _listening_port(own) in ports:
             own.listen(_waiting_max())
 
 
 def reset_on_close(local: Address, remote: Address) -> bool:
-    """Have this process's TCP connection between two addresses closed by a reset; False if none is.
+    """Make the TCP connection between two addresses close by a reset; False if not found.
 
     With a linger time, `close` blocks its thread until the other side has received everything or
-    the time is over. Without any, the kernel goes on sending to a host that is cut off, and a TLS
-    link that is dialled again meanwhile was not led again within 30 s. A reset drops what is
-    unsent: it is older than what the next link brings.
+    the time is over. Without it, the kernel keeps sending to a host that is cut off, and after the
+    TLS link was dialled again the robot was not led within 30 s. A reset drops unsent data, which
+    is older than what the next link carries.
     """
     for own in _own_sockets():
-        with contextlib.suppress(OSError):  # it has no peer
+        with contextlib.suppress(OSError):  # not connected
             if (own.getsockname()[:2], own.getpeername()[:2]) == (local, remote):
                 own.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
                 return True
@@ -49,7 +49,7 @@ def reset_on_close(local: Address, remote: Address) -> bool:
 
 
 def addresses_of(host: str) -> set[IpAddress]:
-    """Return the addresses of a host, none if its name is unknown. A name lookup may block."""
+    """Return the addresses of a host; empty if its name is unknown. A name lookup may block."""
     try:
         rows = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
@@ -58,7 +58,7 @@ def addresses_of(host: str) -> set[IpAddress]:
 
 
 def _own_sockets() -> Iterator[socket.socket]:
-    """Yield each IP socket of this process; they are not ours to close."""
+    """Yield each IP socket of this process; the caller must not close it."""
     for entry in Path("/proc/self/fd").iterdir():
         try:
             if not str(entry.readlink()).startswith("socket:"):
@@ -81,7 +81,7 @@ def _listening_port(own: socket.socket) -> int | None:
 
 
 def _waiting_max() -> int:
-    """Return the backlog for a queue of one; without SYN cookies the kernel then takes no call."""
+    """Return the backlog for a queue of one; without SYN cookies, 0 would accept nothing."""
     return 0 if _SYN_COOKIES.exists() and _SYN_COOKIES.read_text().strip() != "0" else 1
 
 
@@ -92,11 +92,11 @@ _TCP: Final = ("tcp", "tcp6")
 _ESTABLISHED: Final = re.compile(
     rb"^ *\d+: \S+ ([0-9A-F]+):([0-9A-F]{4}) 01 (?:\S+ +){5}(\d+)", re.MULTILINE
 )
-"""Other address and port, and the socket's number."""
+"""Remote address and port, and the socket's inode."""
 
 
 def established(inodes: Collection[int], proc_net: Path = _PROC_NET) -> set[Address]:
-    """Return the other ends, numeric address and port, of TCP connections by their sockets."""
+    """Return the remote ends, numeric address and port, of TCP connections by their inodes."""
     return {
         (str(_address(address)), int(port, 16))
         for address, port, inode in _ESTABLISHED.findall(_tables(proc_net, *_TCP))
@@ -105,7 +105,7 @@ def established(inodes: Collection[int], proc_net: Path = _PROC_NET) -> set[Addr
 
 
 def _tables(proc_net: Path, *names: str) -> bytes:
-    """Return tables of the kernel, one after the other; a kernel without IPv6 lacks one."""
+    """Return the kernel's tables, concatenated; a kernel without IPv6 lacks one."""
     found = b""
     for name in names:
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""Why a link over TLS does not come: Zenoh tells nobody, so it is tried again beside Zenoh."""
+"""Cause of a failed TLS link: Zenoh does not report it, so the handshake is repeated here."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from shared.config.endpoints import host_and_port
 
 _CONNECT_S: Final = 1.0
 _ALERT_S: Final = 0.3
-"""A listener that does not believe our certificate says so after the handshake (RFC 8446)."""
+"""Wait for an alert: a listener rejects our certificate only after the handshake (RFC 8446)."""
 
 _ALERTS: Final = {
-    "CERTIFICATE_EXPIRED": "by its clock our certificate has expired, or is not valid yet",
-    "UNKNOWN_CA": "our certificate is of an authority that it does not know",
-    "CERTIFICATE_REQUIRED": "it wants a certificate, and has got none",
-    "BAD_CERTIFICATE": "it does not believe our certificate",
-    "DECRYPT_ERROR": "our certificate is of another authority of the same name",
-    "CERTIFICATE_UNKNOWN": "it does not believe our certificate",
+    "CERTIFICATE_EXPIRED": "by its clock, our certificate has expired or is not valid yet",
+    "UNKNOWN_CA": "it does not know the authority that signed our certificate",
+    "CERTIFICATE_REQUIRED": "it requires a certificate and received none",
+    "BAD_CERTIFICATE": "it rejects our certificate",
+    "DECRYPT_ERROR": "our certificate was signed by another authority of the same name",
+    "CERTIFICATE_UNKNOWN": "it rejects our certificate",
 }
 _VERDICTS: Final = {
-    7: "is of another authority",  # certificate signature failure
+    7: "was signed by another authority",  # certificate signature failure
     9: "is not valid yet",
     10: "has expired",
-    19: "is of another authority",  # self-signed certificate in certificate chain
-    20: "is of another authority",  # unable to get local issuer certificate
+    19: "was signed by another authority",  # self-signed certificate in certificate chain
+    20: "was signed by another authority",  # unable to get local issuer certificate
 }
-"""By OpenSSL's X509_V_ERR codes: its words change from version to version."""
+"""By OpenSSL's X509_V_ERR code, because its texts change from version to version."""
 
 
 def own_fault(own: Credentials) -> str:
-    """Return what is wrong with a certificate by this host's clock and authority; else "".
+    """Return the fault of a certificate by this host's clock and authority; "" if valid.
 
-    A handshake in memory: no link, and no library beside Python's.
+    Uses a handshake in memory: no link, and no library beside Python's.
     """
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
@@ -55,12 +55,12 @@ def own_fault(own: Credentials) -> str:
     except ssl.SSLCertVerificationError as error:
         return _verdict(error)
     except ssl.SSLError as error:
-        return f"is not believed: {error.reason}"
+        return f"is rejected: {error.reason}"
     return ""
 
 
 def refusal(own: Credentials, endpoint: str) -> str:
-    """Return why a link to tls/HOST:PORT does not come, in words; empty if TLS takes it.
+    """Return why a link to tls/HOST:PORT fails, in words; empty if TLS accepts it.
 
     Takes up to 1.3 s; not for a control loop.
     """
@@ -93,6 +93,6 @@ def _client(own: Credentials) -> ssl.SSLContext:
 def _verdict(error: ssl.SSLCertVerificationError) -> str:
     found = error.verify_message
     if "mismatch" in found:
-        return f"is another host's ({found})"
+        return f"belongs to another host ({found})"
     now = f"{dt.datetime.now(dt.UTC):%Y-%m-%d %H:%M} UTC"
-    return f"{_VERDICTS.get(error.verify_code, found)}, by this host's clock ({now})"
+    return f"{_VERDICTS.get(error.verify_code, found)} (this host's clock: {now})"

@@ -1,4 +1,4 @@
-"""The one table of topics: key, type, rate, priority, who writes, who reads (docs/networks.md)."""
+"""Table of topics: key, type, rate, priority, writers and readers (docs/networks.md)."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class Priority(IntEnum):
 _REAL_TIME, _DATA, _BACKGROUND = Priority
 
 OPERATOR: Final = "operator"
-"""Who leads by a tool: `xrl estop`, `xrl demo`, ..."""
+"""Name of a tool that may act: `xrl estop`, `xrl demo`, ..."""
 VIEWER: Final = "viewer"
-"""Who only looks."""
+"""Name of a tool that only reads."""
 RECORDER: Final = "recorder"
 HOST_RECORDER: Final = "host_recorder"
-"""One host's own recorder: on the bus a tool, which listens nowhere."""
+"""Recorder of one host: on the bus a tool, which listens nowhere."""
 READERS_OF_ALL: Final = (RECORDER, OPERATOR, VIEWER)
 PRINCIPALS: Final = (*SERVICES, OPERATOR, VIEWER)
-"""Every name that a certificate can have under `mtls`; the network proxy is no part of it."""
+"""Every name that a certificate can have under `mtls`; the network proxy has no certificate."""
 
 
 class Topic(msgspec.Struct, frozen=True):
@@ -44,15 +44,15 @@ class Topic(msgspec.Struct, frozen=True):
     """Nominal rate, as `deploy/robot.toml` sets it; 0 for events."""
     priority: Priority
     writers: tuple[str, ...]
-    """Who may put it: services, `operator`, or `*`, the module of the key (docs/security.md)."""
+    """Allowed senders: services, `operator`, or `*`, the module in the key (docs/security.md)."""
     readers: tuple[str, ...]
     """Services that use it; `READERS_OF_ALL` may read every topic."""
     why: str
     recorded: bool = True
     batch: Topic | None = None
-    """The topic that takes it to the recorder, with others (`Batch`); None: its own key does."""
+    """Topic whose batches carry it to the recorder (`Batch`); None: its own key does."""
     closes: bool = False
-    """True if the batch leaves with it."""
+    """True if this message completes the batch."""
 
     def key(self, robot: str, module: str = "") -> str:
         """Return the full key, for example `xrl/lab/joint/ankle_right/state`."""
@@ -70,11 +70,11 @@ JOINT_BATCH: Final = Topic(
 )  # fmt: skip
 PLANNER_BATCH: Final = Topic(
     "planner/batch", traces.Batch, 250.0, _DATA, ("planner",), (),
-    "commands and status of a tick, and checkpoints, for the recorder", recorded=False,
+    "commands and status of each tick, and checkpoints, for the recorder", recorded=False,
 )  # fmt: skip
 JOINT_STATE: Final = Topic(
     "joint/*/state", messages.JointState, 250.0, _REAL_TIME, ("*",), ("planner",),
-    "the planner's input; its stamp is echoed", batch=JOINT_BATCH,
+    "input of the planner, which echoes the timestamp", batch=JOINT_BATCH,
 )  # fmt: skip
 JOINT_COMMAND: Final = Topic(
     "joint/*/command", messages.JointCommand, 250.0, _REAL_TIME, ("planner",), ("*",),
@@ -86,20 +86,20 @@ JOINT_EVENT: Final = Topic(
 )  # fmt: skip
 JOINT_TRACE: Final = Topic(
     "joint/*/trace", traces.JointTrace, 50.0, _BACKGROUND, ("*",), (),
-    "every cycle's inputs: a joint service can be re-executed from them, bit for bit",
+    "inputs of every cycle, from which a joint service is re-executed bit for bit",
     batch=JOINT_BATCH, closes=True,
 )  # fmt: skip
 WRENCH: Final = Topic(
     "harness/wrench", messages.Wrench, 250.0, _DATA, ("harness",), ("planner",),
-    "wrench of the operator on the torso",
+    "wrench that the operator applies to the torso",
 )  # fmt: skip
 ATTITUDE: Final = Topic(
     "imu/attitude", messages.Attitude, 100.0, _DATA, ("imu",), ("planner",),
-    "direction of up, where an IMU is fitted",
+    "direction of up, if an IMU is fitted",
 )  # fmt: skip
 HARNESS_TARE: Final = Topic(
     "harness/tare", messages.TareRequest, 0.0, _DATA, (OPERATOR,), ("harness",),
-    "request for a new zero of the harness sensor",
+    "request to zero the harness sensor",
 )  # fmt: skip
 PLANNER_STATUS: Final = Topic(
     "planner/status", messages.PlannerStatus, 250.0, _DATA, ("planner",), (),
@@ -107,7 +107,7 @@ PLANNER_STATUS: Final = Topic(
 )  # fmt: skip
 PLANNER_CHECKPOINT: Final = Topic(
     "planner/checkpoint", traces.PlannerCheckpoint, 1.0, _BACKGROUND, ("planner",), (),
-    "the planner's state, more often at its start: re-execution can start here",
+    "the planner's state, from which re-execution can start; more frequent at start-up",
     batch=PLANNER_BATCH,
 )  # fmt: skip
 OPERATOR_INTENT: Final = Topic(
@@ -116,11 +116,11 @@ OPERATOR_INTENT: Final = Topic(
 )  # fmt: skip
 OPERATOR_HAND: Final = Topic(
     "operator/hand", messages.HandLead, 0.0, _DATA, (OPERATOR,), ("simulator",),
-    "leads and pushes the simulated robot by hand; nothing on a real one reads it",
+    "leads and pushes the simulated robot by hand; no service of a real robot reads it",
 )  # fmt: skip
 ESTOP: Final = Topic(
     "estop", messages.Estop, 0.0, _REAL_TIME, (OPERATOR,), MODULES,
-    "emergency stop: every module to DAMP",
+    "emergency stop: every module goes to DAMP",
 )  # fmt: skip
 SIM_TRUTH: Final = Topic(
     "sim/truth", traces.SimTruth, 100.0, _BACKGROUND, ("simulator",), (),
@@ -128,7 +128,7 @@ SIM_TRUTH: Final = Topic(
 )  # fmt: skip
 SIM_STATE: Final = Topic(
     "sim/state", traces.SimState, 10.0, _BACKGROUND, ("simulator",), (),
-    "complete simulated world: `xrl log whatif` continues from it",
+    "complete state of the simulated world, from which `xrl log whatif` continues",
 )  # fmt: skip
 SIM_CONTROL: Final = Topic(
     "sim/control", messages.SimControl, 0.0, _DATA, (OPERATOR,), ("simulator",),
@@ -140,21 +140,21 @@ RUN_EVENT: Final = Topic(
 )  # fmt: skip
 LINK_EVENT: Final = Topic(
     "link/event", traces.LinkEvent, 0.0, _DATA, ("network_proxy",), (),
-    "impairments of the network on purpose: a log without them is no evidence",
+    "deliberate impairments of the network; a log without them is not evidence",
 )  # fmt: skip
 TOOLS: Final = Topic(
     "recorder/tools", messages.ToolRoster, 2.0, _BACKGROUND, (RECORDER,), (),
-    "who looks on or leads by a tool, and when",
+    "which tools watch or lead, and when",
 )  # fmt: skip
 
 TOPICS: Final = tuple(row for row in tuple(globals().values()) if isinstance(row, Topic))
-"""All of the rows above, in their order."""
+"""All rows above, in order."""
 
 _OF_TOOLS: Final = frozenset(topic.name for topic in TOPICS if OPERATOR in topic.writers)
 
 
 def several_may_write(key: str) -> bool:
-    """Return True for a full key on which several tools may put, each with its own numbers."""
+    """Return True if several tools may write a full key, each with its own sequence numbers."""
     return key.split("/", 2)[-1] in _OF_TOOLS
 
 
@@ -166,7 +166,7 @@ def keys(topic: Topic, robot: str) -> tuple[str, ...]:
 
 
 def keys_by_batch(robot: str) -> dict[str, set[str]]:
-    """Return the full keys whose messages the batches on a full key may hold."""
+    """Return, by full key of a batch, the full keys that the batch may contain."""
     found: dict[str, set[str]] = {}
     for topic in TOPICS:
         if topic.batch is not None:
@@ -199,7 +199,7 @@ def read_keys(robot: str, name: str) -> tuple[str, ...]:
 
 
 def keys_between(robot: str, writer: str, reader: str) -> tuple[str, ...]:
-    """Return the full keys that one may put and the other may receive."""
+    """Return the full keys that the writer may put and the reader may receive."""
     written = written_keys(robot, writer)
     if reader in READERS_OF_ALL:
         return written

@@ -17,30 +17,30 @@ from shared.exceptions import ConfigError
 S = TypeVar("S")
 
 RETRY_NS: Final = 200 * NS_PER_MS
-"""Shortest time between two attempts to open the link."""
+"""Minimum time between two attempts to open the link."""
 
 DRAIN_MAX: Final = 1024
-"""Most frames taken in one read, so that a flooded bus cannot hold up the loop."""
+"""Maximum number of frames per read, so that a flooded bus cannot block the loop."""
 
 
 class CanSensor(Generic[S]):
-    """A sensor through python-can; opens the link again by itself when it goes away."""
+    """A sensor through python-can; reopens a lost link on its own."""
 
     def __init__(
         self, interface: str, channel: str, assembler: FrameGroup[S], *, pause_ns: int
     ) -> None:
-        """Prepare; the link is opened by the first `newest`.
+        """Prepare; the first `newest` opens the link.
 
-        After a longer time than `pause_ns` between two reads, frames that waited on the link have
-        an unknown age (this process was stopped, and a full queue keeps the oldest frames) and are
-        discarded. Raises ConfigError if python-can knows no such interface.
+        If more than `pause_ns` passes between two reads, the frames that waited on the link have an
+        unknown age (this process was stopped, and a full queue keeps the oldest frames) and are
+        discarded. Raises ConfigError if python-can does not know the interface.
         """
         if interface not in can.VALID_INTERFACES:
-            raise _unusable(interface, "not known to python-can")
+            raise _unusable(interface, "python-can does not know this interface")
         self.opened = 0
         """Times the link was opened."""
         self.discarded = 0
-        """Reads whose samples were of unknown age: after a pause, or a queue too long."""
+        """Reads discarded for their unknown age: after a pause, or with a queue too long."""
         self._interface = interface
         self._channel = channel
         self._pause_ns = pause_ns
@@ -57,13 +57,13 @@ class CanSensor(Generic[S]):
 
     @property
     def malformed(self) -> int:
-        """Frames of the sensor that were of the wrong length or out of order."""
+        """Sensor frames of a wrong length or out of order."""
         return self._assembler.malformed
 
     def newest(self, now_ns: int) -> S | None:
         """Return the newest sample that came since the last call, or None; never blocks.
 
-        Never raises for a lost link: that is None until it is back.
+        Never raises for a lost link; returns None until it is back.
         """
         last_ns, self._last_read_ns = self._last_read_ns, now_ns
         if self._bus is None:
@@ -90,7 +90,7 @@ class CanSensor(Generic[S]):
         self._assembler.reset()
 
     def _open(self, now_ns: int) -> can.BusABC | None:
-        """Return the link, or None if it is not there or was tried a moment ago.
+        """Return the link, or None if it is missing or the last attempt was too recent.
 
         Raises ConfigError if the interface cannot be used on this machine, now or later.
         """
@@ -107,7 +107,7 @@ class CanSensor(Generic[S]):
         return link
 
     def _drain(self, link: can.BusABC) -> tuple[S | None, bool]:
-        """Return the newest complete sample, and True if nothing is left behind it."""
+        """Return the newest complete sample, and True if no frame is left in the queue."""
         newest: S | None = None
         for _ in range(DRAIN_MAX):
             try:
@@ -136,14 +136,14 @@ def sensor_of(
 
 
 def is_data_frame(message: can.Message) -> bool:
-    """Return True for a standard data frame: what drives and sensors send.
+    """Return True for a standard data frame, the only kind that drives and sensors send.
 
-    An error frame's id tells what is wrong with the bus, and an extended id may equal the standard
-    one of another sender. A request is a remote frame; so is the echo of an own one.
+    An error frame's id describes a fault of the bus, and an extended id may equal the standard one
+    of another sender. A request is a remote frame, and so is its echo.
     """
     return not (message.is_error_frame or message.is_remote_frame or message.is_extended_id)
 
 
 def _unusable(interface: str, why: str) -> ConfigError:
-    right = f"one of {', '.join(sorted(can.VALID_INTERFACES))}"
+    right = f"use one of {', '.join(sorted(can.VALID_INTERFACES))}"
     return ConfigError("robot file", "can.*.interface", f"{interface!r}: {why}", right)

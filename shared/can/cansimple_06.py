@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 
 class Command06(IntEnum):
-    """Command ids that 0.5 has not, or uses for something else."""
+    """Command ids that 0.5 lacks or uses for something else."""
 
     GET_VERSION = 0x000
     GET_ERROR = 0x003
@@ -143,7 +143,7 @@ def pack_error(active_errors: int, disarm_reason: int) -> bytes:
 
 
 def pack_sdo(opcode: int, endpoint: int, value: bytes = b"") -> bytes:
-    """Pack 0x004, or 0x005 with opcode 0; the value as the endpoint's type has it, <= 4 bytes."""
+    """Pack 0x004, or 0x005 with opcode 0; the value has the endpoint's type, at most 4 bytes."""
     return _SDO.pack(opcode, endpoint) + value
 
 

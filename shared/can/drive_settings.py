@@ -1,11 +1,11 @@
 """Settings that this robot needs on its ODrives: one table, by the names of firmware 0.5.6.
 
 With factory settings an ODrive disarms, limits or answers in ways that make this robot fall
-(docs/drives.md#traps). The simulator's drives are set by this table, `xrl doctor` compares a drive
+(docs/drives.md#traps). The simulator sets its drives by this table, `xrl doctor` compares a drive
 with it and `xrl drive configure` writes it, so the three cannot disagree.
 
-Modes, gains and limits that the joint services write at arming or in every cycle are listed too,
-where a drive that somebody else armed would be wrong without them.
+The table also has modes, gains and limits that the joint services write at arming or in every
+cycle, if a drive that something else armed would be wrong without them.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ AXES: Final = ("axis0", "axis1")
 
 CAN_BAUD_RATE: Final = 1_000_000
 OVERVOLTAGE_MAX: Final = 59.92
-"""V; the firmware's default on a 56 V board. Above it the output stage is not protected."""
+"""V; the firmware's default on a 56 V board. Above it nothing protects the output stage."""
 OVERSPEED_TOLERANCE: Final = 1.2
 """The firmware's default; closer to 1, a noisy estimate at vel_limit disarms."""
 SPINOUT_POWER: Final = 100.0
-"""W; 10 as shipped. A motor that brakes with more than this, and takes more than this beyond the
-copper loss of its calibrated resistance, disarms: its encoder has slipped. A winding at 100 C has
-30 % more resistance, at 30 A and 0.1 ohm 40 W, at 40 A 72 W."""
+"""W; 10 as shipped. A motor disarms if it brakes with more than this and takes more than this
+beyond the copper loss of its calibrated resistance: its encoder has slipped. A winding at 100 C has
+30 % more resistance: 40 W more at 30 A and 0.1 ohm, 72 W at 40 A."""
 
 _RELATIVE: Final = 1e-6
-"""A drive keeps single floats."""
+"""Relative tolerance: a drive keeps single floats."""
 
 
 class Compare(Enum):
-    """How a setting is compared with its wanted value."""
+    """Comparison of a setting with its wanted value."""
 
     EQUAL = ""
     AT_LEAST = ">= "
@@ -54,25 +54,25 @@ class Need(NamedTuple):
     drive: DriveConfig
     encoder_counts_per_turn: int
     watchdog: bool = True
-    """Whether the drives' watchdogs are to run, if the robot file gives them a timeout."""
+    """True if the drives' watchdogs must run, provided that the robot file gives a timeout."""
     node_id: int | None = None
-    """CAN node of the axis; None: not known here, and not wanted."""
+    """CAN node of the axis; None: unknown here, and not checked."""
 
 
 class _Setting(NamedTuple):
     """One row of the table."""
 
     name: str
-    """Below `axis0.` and `axis1.`, or of the whole drive."""
+    """Name below `axis0.` and `axis1.`, or of the whole drive."""
     wanted: Callable[[Need], Value | None]
-    """None: nothing is wanted."""
+    """Wanted value; None: any."""
     why: str
-    """What happens otherwise."""
+    """Consequence of any other value."""
     compare: Compare = Compare.EQUAL
 
 
 class WantedSetting(NamedTuple):
-    """A setting of one drive, by its whole name, with its value worked out."""
+    """A setting of one drive, by its whole name, with its computed value."""
 
     name: str
     value: Value
@@ -93,71 +93,71 @@ class WantedSetting(NamedTuple):
 
 AXIS_TABLE: Final[tuple[_Setting, ...]] = (
     _Setting("config.watchdog_timeout", lambda need: need.drive.watchdog_timeout,
-        "a drive left alone stops after this; too short, a hiccup disarms"),
+        "a drive that receives nothing disarms after this; if too short, a hiccup disarms it"),
     _Setting("config.enable_watchdog",
         lambda need: need.watchdog and need.drive.watchdog_timeout > 0.0,
-        "a watchdog that fires lets the module go limp: off with the onboard loop, else on"),
+        "if it fires, the module goes limp: off with the onboard loop, else on"),
     _Setting("config.startup_motor_calibration", lambda _: False,
-        "the motor would move by itself at power-up"),
+        "the motor would move on its own at power-up"),
     _Setting("config.startup_encoder_offset_calibration", lambda _: False,
-        "the motor would turn by itself at power-up"),
+        "the motor would turn on its own at power-up"),
     _Setting("config.startup_closed_loop_control", lambda _: False,
-        "the axis would arm by itself at power-up, before anything looks after it"),
+        "the axis would arm on its own at power-up, before a service controls it"),
     _Setting("config.can.node_id", lambda need: need.node_id,
-        "the services would speak to another axis, or to none"),
+        "the services would address another axis, or none"),
     _Setting("config.can.heartbeat_rate_ms", lambda need: need.drive.heartbeat_period_ms,
-        "an axis that disarms shows in its next heartbeat only"),
+        "only the next heartbeat shows that an axis has disarmed"),
     _Setting("config.can.encoder_rate_ms", lambda need: need.drive.encoder_period_ms,
-        "the encoder frames are the joint service's clock; as shipped they come at 100 Hz"),
+        "encoder frames clock the joint service; the factory setting is 100 Hz"),
     _Setting("controller.config.input_mode", lambda _: int(InputMode.PASSTHROUGH),
         "any other mode filters or ignores the targets"),
     _Setting("controller.config.vel_integrator_gain", lambda _: 0.0,
-        "an integrator winds up under the robot's weight; the law has none in the drive"),
+        "an integrator winds up under the robot's weight; the law uses none in the drive"),
     _Setting("controller.config.vel_limit", lambda need: need.drive.vel_limit,
-        "faster than this times vel_limit_tolerance disarms with OVERSPEED, in torque mode too"),
+        "a speed above this times vel_limit_tolerance disarms with OVERSPEED, in torque mode too"),
     _Setting("controller.config.vel_limit_tolerance", lambda _: OVERSPEED_TOLERANCE,
         "OVERSPEED would fire close to vel_limit", Compare.AT_LEAST),
     _Setting("controller.config.enable_overspeed_error", lambda _: True,
-        "a motor that runs away would not be stopped"),
+        "a runaway motor would not be stopped"),
     _Setting("controller.config.enable_torque_mode_vel_limit", lambda _: False,
-        "in torque mode it cuts the torque by vel_gain: with that at 0, all of it"),
+        "in torque mode it limits the torque by vel_gain; at vel_gain = 0 no torque is left"),
     _Setting("controller.config.spinout_electrical_power_threshold", lambda _: SPINOUT_POWER,
-        "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
+        "an axis that sinks under load with a warm winding disarms (SPINOUT_DETECTED)",
         Compare.AT_LEAST),
     _Setting("controller.config.spinout_mechanical_power_threshold", lambda _: -SPINOUT_POWER,
-        "a warm winding that sinks under load disarms with SPINOUT_DETECTED: the leg lets go",
+        "an axis that sinks under load with a warm winding disarms (SPINOUT_DETECTED)",
         Compare.AT_MOST),
     _Setting("motor.config.pre_calibrated", lambda _: True,
-        "after each power-up the motor would have to be calibrated before it arms"),
+        "the motor would have to be calibrated after each power-up before it arms"),
     _Setting("motor.config.torque_constant", lambda need: need.drive.torque_constant,
         "every torque would be wrong by the ratio"),
     _Setting("motor.config.current_lim", lambda need: need.drive.current_lim,
-        "less (10 A as shipped) cannot carry the robot, more is not what the robot file checks"),
+        "less (factory: 10 A) cannot carry the robot; more is beyond the robot file's checks"),
     _Setting("motor.fet_thermistor.config.enabled", lambda _: True,
         "the output stage would not protect itself"),
     _Setting("encoder.config.cpr", lambda need: need.encoder_counts_per_turn,
         "every angle would be wrong by the ratio"),
     _Setting("encoder.config.bandwidth", lambda need: need.drive.encoder_bandwidth,
-        "slower, the drive's damping comes late and shakes the rotors; faster, it is noisy"),
+        "if lower, the drive's damping lags and shakes the rotors; if higher, it is noisy"),
     _Setting("encoder.config.pre_calibrated", lambda _: True,
-        "after each power-up the motor would have to turn by itself before it arms"),
+        "the motor would have to turn on its own after each power-up before it arms"),
 )  # fmt: skip
 """Settings of each axis, in the order in which they are written: a watchdog that is enabled before
-its timeout is there has nothing to count down, and expires at once."""
+its timeout is set expires at once."""
 
 DRIVE_TABLE: Final[tuple[_Setting, ...]] = (
     _Setting("config.dc_max_negative_current", lambda need: need.drive.dc_max_negative_current,
-        "braking legs push current back; -0.01 A as shipped trips both axes at once"),
+        "braking legs feed current back; the factory setting, -0.01 A, trips both axes at once"),
     _Setting("config.dc_bus_overvoltage_trip_level", lambda _: OVERVOLTAGE_MAX,
-        "what braking legs push back could destroy the output stage", Compare.AT_MOST),
+        "the current that braking legs feed back could destroy the output stage", Compare.AT_MOST),
     _Setting("can.config.baud_rate", lambda _: CAN_BAUD_RATE,
-        "the bus carries two axes at the joint services' rate at 1 Mbit/s only"),
+        "the bus carries two axes at the joint services' rate only at 1 Mbit/s"),
 )  # fmt: skip
 """Settings of the whole ODrive."""
 
 
 def of_module(robot: RobotConfig, module: str) -> tuple[WantedSetting, ...]:
-    """Return all that is wanted of a module's ODrive."""
+    """Return all wanted settings of a module's ODrive."""
     counts = robot.joint.encoder_counts_per_turn
     common = Need(robot.drive, counts)
     rows = [_worked_out(setting, common, "") for setting in DRIVE_TABLE]

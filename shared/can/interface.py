@@ -1,11 +1,11 @@
-"""A CAN interface of the kernel: how many frames may wait in it, and how they are thrown away.
+"""A CAN interface of the kernel: limit the frames that wait in it, and discard them.
 
-Facts, by Linux' sources (net/can/raw.c, include/linux/can/skb.h, drivers/net/can/dev): a frame
-waits in the interface's queue (pfifo_fast, txqueuelen), charged to its socket (SO_SNDBUF),
-then in the adapter, charged to nobody. Both outlive the socket. Neither drops a frame for its age;
-taking the interface down does, and resets the adapter. SIOCOUTQ is not for CAN sockets, and
-SO_MEMINFO does not count what the adapter has: an own frame that comes back
-(CAN_RAW_RECV_OWN_MSGS) is the only sign that it was transmitted.
+From Linux' sources (net/can/raw.c, include/linux/can/skb.h, drivers/net/can/dev): a frame waits in
+the interface's queue (pfifo_fast, txqueuelen), charged to its socket (SO_SNDBUF), then in the
+adapter, charged to nothing. Both outlive the socket. Neither drops a frame for its age; taking the
+interface down does, and resets the adapter. CAN sockets have no SIOCOUTQ, and SO_MEMINFO does not
+count the adapter's frames: the echo of an own frame (CAN_RAW_RECV_OWN_MSGS) is the only sign that
+it was transmitted.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Final
 from shared.can.unix_can import FRAME_TRUESIZE
 
 QUEUED_MAX: Final = 14
-"""Frames of one process that may wait in the kernel: the longest row that is sent at once."""
+"""Maximum number of frames of one process that wait in the kernel: the longest burst."""
 
 _SIOCGIFFLAGS: Final = 0x8913
 _SIOCSIFFLAGS: Final = 0x8914
@@ -27,10 +27,10 @@ _REQUEST: Final = struct.Struct("16sh22x")
 
 
 def limit_queue(bus: Any) -> None:
-    """Let no more than `QUEUED_MAX` frames of a bus wait, if it has a socket.
+    """Limit the waiting frames of a bus to `QUEUED_MAX`, if it has a socket.
 
-    The kernel doubles what is set, and a socket with half of that in use counts as not writable:
-    python-can sends nothing then.
+    The kernel doubles the value. A socket with half of that in use counts as not writable, and
+    python-can then sends nothing.
     """
     sender = getattr(bus, "socket", None)
     if isinstance(sender, socket.socket):
@@ -38,10 +38,10 @@ def limit_queue(bus: Any) -> None:
 
 
 def restart(bus: Any, channel: str) -> None:
-    """Take a bus's interface down and up again: frames that wait are thrown away.
+    """Take a bus's interface down and up again, which discards the waiting frames.
 
     Raises:
-        OSError: this process may not (CAP_NET_ADMIN), or there is no such interface.
+        OSError: this process may not (CAP_NET_ADMIN), or the interface does not exist.
     """
     own = getattr(bus, "restart", None)
     if own is not None:

@@ -1,6 +1,6 @@
 """CAN frames of the load cells and of the IMU: samples as fixed sequences of frames. Pure.
 
-Another amplifier or IMU needs its part of this file changed and nothing else.
+For another amplifier or IMU, change its part of this file and nothing else.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ def split(frames: Sequence[tuple[int, int]], data: bytes) -> list[tuple[int, byt
 
 
 class FrameGroup(Generic[S]):
-    """Puts the frames of a sample together; never mixes frames across a gap.
+    """Assembler of a sample's frames; never mixes frames across a gap.
 
-    A sample is its frames, (id, bytes) of each, in this order with no other of them in between;
-    `unpack` makes it of their bytes.
+    A sample consists of the frames (id, bytes), in this order and without another of them in
+    between; `unpack` converts their bytes.
     """
 
     def __init__(self, frames: Sequence[tuple[int, int]], unpack: Callable[[bytes], S]) -> None:
         self.malformed = 0
-        """Frames of the sensor that were of the wrong length or out of order."""
+        """Sensor frames of a wrong length or out of order."""
         self._unpack = unpack
         self._index = {can_id: index for index, (can_id, _) in enumerate(frames)}
         self._bytes = [size for _, size in frames]
@@ -69,7 +69,7 @@ class FrameGroup(Generic[S]):
         return self._unpack(bytes(self._data))
 
     def reset(self) -> None:
-        """Forget a sample that is not complete: its rest belongs to another link."""
+        """Discard an incomplete sample: its rest belongs to another link."""
         self._next = 0
 
 
@@ -93,7 +93,7 @@ def pack_forces(forces: Sequence[float]) -> list[tuple[int, bytes]]:
 
 
 class SampleAssembler(FrameGroup[Vector6]):
-    """Makes samples of the load-cell amplifier's frames: six leg forces of one moment.
+    """Assembler of the load-cell amplifier's frames: six leg forces at one time.
 
     Assumption: the paper names no amplifier. This is the simplest layout that a six-channel CAN
     amplifier could have.
@@ -102,9 +102,9 @@ class SampleAssembler(FrameGroup[Vector6]):
         id 0x301   leg 2, leg 3
         id 0x302   leg 4, leg 5
 
-    A force may be anything that a float32 can, NaN included. The frames are full, so there is no
-    sample counter. A gap inside a sample breaks its order; the loss of exactly three frames that
-    straddle two samples is not detected.
+    A force may have any float32 value, including NaN. The frames are full, so there is no sample
+    counter. A gap inside a sample breaks its order; the loss of exactly three frames that straddle
+    two samples is not detected.
     """
 
     def __init__(self) -> None:
@@ -159,11 +159,11 @@ def _imu_sample(data: bytes) -> ImuSample:
 
 
 class ImuAssembler(FrameGroup[ImuSample]):
-    """Makes samples of an Xsens MTi 600's frames: the part of its protocol that is used.
+    """Assembler of an Xsens MTi 600's frames: the part of its protocol that is used.
 
-    The MTi is an AHRS with CAN: its orientation is good to 0.2 .. 0.5 degrees in roll and pitch.
-    In the MT Manager's CAN output, StatusWord, Quaternion and RateOfTurn are switched on, with
-    standard identifiers and the same rate; all is big-endian (MT CAN protocol, MT1604P).
+    The MTi is an AHRS with CAN: its orientation is good to 0.2 .. 0.5 degrees in roll and pitch. In
+    the MT Manager's CAN output, switch on StatusWord, Quaternion and RateOfTurn, with standard
+    identifiers and the same rate. All is big-endian (MT CAN protocol, MT1604P).
 
         id 0x11   uint32      status; bit 1: the orientation is valid
         id 0x21   4 int16     quaternion w, x, y, z in 2^-15: sensor axes to (east, north, up)

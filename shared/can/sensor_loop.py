@@ -1,4 +1,4 @@
-"""The loop of a service that reads a sensor, on whatever clock it is called with."""
+"""Loop of a service that reads a sensor, on the caller's clock."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ M = TypeVar("M", bound=Message)
 
 
 class Sensor(Protocol[S_co]):
-    """Where a sensor's samples come from."""
+    """Source of a sensor's samples."""
 
     def newest(self, now_ns: int, /) -> S_co | None:
         """Return the newest sample that came since the last call, or None; never blocks.
 
-        Never raises for a lost link: that is None until it is back.
+        Never raises for a lost link; returns None until it is back.
         """
 
 
 class SensorLoop(ABC, Generic[S, M]):
-    """One cycle: read, make a message of it, publish.
+    """One cycle: read, make a message, publish.
 
     Attributes:
         cycles: so far.
         skipped: deadlines that were missed and not made up for.
-        unsent: messages that the bus did not take.
+        unsent: messages that the bus did not accept.
     """
 
     def __init__(self, sensor: Sensor[S], publisher: Outbox[M]) -> None:
@@ -43,7 +43,7 @@ class SensorLoop(ABC, Generic[S, M]):
 
     @abstractmethod
     def message(self, now_ns: int, sample: S | None) -> M:
-        """Return what is to be published for the newest sample, None if there is none."""
+        """Return the message to publish for the newest sample, which is None without a new one."""
 
     def cycle(self, now_ns: int) -> M:
         """Run once; return the published message."""

@@ -1,4 +1,4 @@
-"""The process of a service that reads a sensor: cycles on a grid of periods until it is stopped."""
+"""Process of a service that reads a sensor: cycles on a grid of periods until it is stopped."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from shared.config.robot_config import RobotConfig
 
 
 class SensorService(NamedTuple):
-    """What one sensor's service has of its own."""
+    """Parts that differ between the sensors' services."""
 
     rate_hz: float
     sensor: CanSensor[Any]
     loop_on: Callable[[Session], SensorLoop[Any, Any]]
     refused_for: str
-    """What samples that are refused are not."""
+    """Property that the refused samples lack, for the log."""
 
 
 def serve(name: str, about: str, made: Callable[[RobotConfig, Path], SensorService]) -> int:
     """Run a service until SIGTERM or SIGINT; return the exit code.
 
-    `made` takes the robot and the run directory; `about` is the text of `--help`.
+    `made` makes the service from the robot and the run directory; `about` is the text of `--help`.
     """
     parser = process.service_parser(about, f"python -m services.{name}")
     process.add_injected(parser)
@@ -47,7 +47,7 @@ def serve(name: str, about: str, made: Callable[[RobotConfig, Path], SensorServi
     sensor.close()
     logger.info(
         "stopped: %d cycles, %d skipped, %d unsent, link opened %d times; "
-        "samples not %s %d, frames malformed %d",
+        "samples that were not %s: %d, malformed frames: %d",
         loop.cycles, loop.skipped, loop.unsent, sensor.opened,
         service.refused_for, loop.refused, sensor.malformed,
     )  # fmt: skip

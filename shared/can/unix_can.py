@@ -6,13 +6,13 @@ real bus through socketcan drives this one unchanged.
 
 On the wire: SOCK_SEQPACKET; a packet carries one or several 16-byte frames in the layout of
 SocketCAN's `struct can_frame` (id and flags, length, three pad bytes, eight data bytes),
-little-endian. Several frames in one packet cost one system call. Sending never blocks: frames
-for which there is no room raise, as on socketcan.
+little-endian. Several frames in one packet cost one system call. Sending never blocks: a full queue
+raises, as on socketcan.
 
-**A bus that does not acknowledge.** The hub then leaves the packets where they are: in the
-kernel, charged to the sender (SO_SNDBUF), also past its end, and in its order. So a CAN interface
-behaves, whose controller repeats its first frame until somebody acknowledges it. What else an
-interface knows, both sides share in `Interface`.
+**A bus that does not acknowledge.** The hub then leaves the packets in the kernel, in order and
+charged to the sender (SO_SNDBUF), even after the sender's end. A CAN interface behaves the same:
+its controller repeats its first frame until a node acknowledges it. Both sides share the rest of an
+interface's state in `Interface`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FRAME_BYTES: Final = _FRAME.size
 pack_frame: Final = _FRAME.pack
 """Pack id with flags, number of data bytes, and data."""
 PACKET_BYTES: Final = 64 * FRAME_BYTES
-"""Longest packet that either side sends."""
+"""Maximum packet of either side."""
 _DRAIN = 1024  # packets in one call: more than a socket holds
 FRAME_TRUESIZE: Final = 768
 """Bytes that a short packet takes of SO_SNDBUF: sk_buff and data; a CAN frame takes the same."""
@@ -59,14 +59,14 @@ def pack_frames(frames: Iterable[Frame]) -> bytes:
 
 
 def unpack_frames(packet: bytes) -> list[Frame]:
-    """Return the frames of a packet; none if it is not a whole number of frames."""
+    """Return the frames of a packet; empty if it is not a whole number of frames."""
     if len(packet) % FRAME_BYTES:
         return []
     return [(can_id, data[:length]) for can_id, length, data in _FRAME.iter_unpack(packet)]
 
 
 FULL_AT: Final = 4
-"""Place of `Interface.full` in its memory."""
+"""Offset of `Interface.full` in its memory."""
 
 
 class Interface:
@@ -76,10 +76,10 @@ class Interface:
         """Open the state of the interface with this socket; the hub creates it.
 
         Raises:
-            OSError: there is none.
+            OSError: it does not exist.
         """
         self.path = Path(f"{os.fspath(channel)}.state")
-        if create:  # a client of the hub before may still have the old file mapped
+        if create:  # a client of an earlier hub may still have the old file mapped
             self.path.unlink(missing_ok=True)
         flags = os.O_RDWR | (os.O_CREAT | os.O_EXCL if create else 0)
         descriptor = os.open(self.path, flags, 0o600)
@@ -101,11 +101,11 @@ class Interface:
 
     @property
     def restarts(self) -> int:
-        """How often the interface was taken down and up: each empties its queue."""
+        """Times the interface was taken down and up; each empties its queue."""
         return int.from_bytes(self.memory[:FULL_AT], "little")
 
     def restart(self) -> None:
-        """Ask the hub to throw away all frames that wait."""
+        """Request the hub to discard all waiting frames."""
         count = self.restarts + 1 & 0xFFFF_FFFF
         self.memory[:FULL_AT] = count.to_bytes(FULL_AT, "little")
 
@@ -118,8 +118,8 @@ class UnixCanBus(can.BusABC):
     """Client of a `UnixCanHub`, declared to python-can as interface `xrl_unix`.
 
     Attributes:
-        dropped: frames for which there was no room: each `send` of such raised ENOBUFS.
-        socket: its SO_SNDBUF limits what may wait, as on socketcan.
+        dropped: frames that did not fit the queue; `send` raised ENOBUFS for each.
+        socket: its SO_SNDBUF limits the waiting frames, as on socketcan.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class UnixCanBus(can.BusABC):
         """Send one frame without waiting, whatever `timeout` says.
 
         Raises:
-            can.CanOperationError: there is no room (ENOBUFS), or the hub is gone.
+            can.CanOperationError: the queue is full (ENOBUFS), or the hub is gone.
         """
         if not self.send_packet(pack_frame(_can_id(msg), msg.dlc, bytes(msg.data))):
             raise can.CanOperationError(
@@ -158,9 +158,9 @@ class UnixCanBus(can.BusABC):
             )
 
     def send_packet(self, packet: bytes) -> int:
-        """Send packed frames without waiting; return how many bytes went: all of them, or 0.
+        """Send packed frames without waiting; return the number of bytes sent: all, or 0.
 
-        The fast path around `can.Message`. A hub that is gone shows in receiving.
+        The fast path around `can.Message`. The loss of the hub shows when receiving.
         """
         if not self._interface.memory[FULL_AT]:
             try:
@@ -175,7 +175,7 @@ class UnixCanBus(can.BusABC):
         return 0
 
     def recv_packet(self, timeout: float) -> bytes:
-        """Wait for a packet and return all packets that are there as one, in order.
+        """Wait for a packet and return all packets that have arrived as one, in order.
 
         The fast path around `can.Message`; filters are not applied. Empty after `timeout` seconds.
         Raises can.CanOperationError once the hub is gone.
@@ -205,7 +205,7 @@ class UnixCanBus(can.BusABC):
         return carried
 
     def restart(self) -> None:
-        """Take the interface down and up: what waits is thrown away, of every client."""
+        """Take the interface down and up: discard the waiting frames of every client."""
         self._interface.restart()
         self._uncarried.clear()
 
@@ -214,13 +214,13 @@ class UnixCanBus(can.BusABC):
         return self.socket.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus; frames that wait go on waiting."""
+        """Leave the bus; waiting frames keep waiting."""
         super().shutdown()
         self.socket.close()
         self._interface.close()
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        """Return the next frame as python-can asks for it; filters are left to python-can."""
+        """Return the next frame for python-can, which applies the filters."""
         if not self._waiting:
             packet = self._receive(timeout)
             if packet is None:
@@ -230,7 +230,7 @@ class UnixCanBus(can.BusABC):
         return (self._waiting.popleft() if self._waiting else None), False
 
     def _receive(self, timeout: float | None) -> bytes | None:
-        """Return a packet of whole frames, or None when `timeout` seconds have brought none.
+        """Return a packet of whole frames, or None after `timeout` seconds without one.
 
         The kernel keeps the time (SO_RCVTIMEO): one system call instead of two.
         """
@@ -262,7 +262,7 @@ def _can_id(message: can.Message) -> int:
 
 
 def _message(frame: Frame, timestamp: float) -> can.Message:
-    """Return a frame as python-can has it."""
+    """Return a frame as python-can's message."""
     can_id, data = frame
     extended = bool(can_id & EXTENDED_FLAG)
     return can.Message(
@@ -276,7 +276,7 @@ def _message(frame: Frame, timestamp: float) -> can.Message:
 
 
 def _connect(channel: str) -> tuple[socket.socket, Interface]:
-    """Connect to a hub; a hub too busy to take us is an error, not a wait."""
+    """Connect to a hub; raise at once if the hub is too busy."""
     client = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     client.setblocking(False)
     try:
@@ -292,7 +292,7 @@ def _connect(channel: str) -> tuple[socket.socket, Interface]:
 
 
 def _set_receive_timeout(client: socket.socket, timeout: float | None) -> None:
-    """Set SO_RCVTIMEO; None waits for ever, anything else at least 1 us."""
+    """Set SO_RCVTIMEO; None waits forever, anything else at least 1 us."""
     microseconds = 0 if timeout is None else max(1, int(timeout * 1e6))
     value = struct.pack("@ll", *divmod(microseconds, 1_000_000))
     client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)

@@ -1,8 +1,8 @@
-"""Computes the load that drives put on a CAN bus at 1 Mbit/s (docs/drives.md). Pure.
+"""Load of a CAN bus with drives at 1 Mbit/s (docs/drives.md). Pure.
 
-A standard data frame with n bytes is 47 + 8n bits long, the gap after it included. After five
-equal bits the sender stuffs one more; up to the end of the checksum, over 34 + 8n bits, that is
-at most one in four, and `STUFFING` as measured on this robot's frames.
+A standard data frame with n bytes is 47 + 8n bits long, including the gap after it. After five
+equal bits the sender stuffs one more, up to the end of the checksum: over 34 + 8n bits at most one
+in four. `STUFFING` was measured on this robot's frames.
 """
 
 from __future__ import annotations
@@ -15,25 +15,24 @@ from shared.exceptions import ConfigError
 BITRATE: Final = 1_000_000
 """bit/s"""
 LOAD_MAX: Final = 0.85
-"""Share of a bus that may be planned with: requests, arming and errors come on top, and a full
-bus delays a frame by as much as is queued before it. Torques for 12 axes at 333 Hz, with
-heartbeats at 10 Hz, are 82 %."""
+"""Maximum planned load of a bus. Requests, arming and errors come on top, and a full bus delays a
+frame by everything queued before it. Torques for 12 axes at 333 Hz, with heartbeats at 10 Hz, are
+82 %."""
 STUFFING: Final = 0.06
-"""Stuff bits for each bit that can be stuffed: 0.05 while the robot stands."""
+"""Stuff bits per bit that can be stuffed; 0.05 while the robot stands."""
 BLEND_MAX: Final = 0.98
-"""Highest load of a bus while gains blend, for tenths of a second. Above it frames queue up, and
-joints are controlled on old samples.
-"""
+"""Maximum load of a bus while gains blend, for tenths of a second. Above it frames queue up, and
+joints are controlled on old samples."""
 GAINS_HZ: Final = 10.0
-"""How often the onboard loop's gains go out even if they stand still."""
+"""Rate at which the onboard loop's gains are sent when they do not change."""
 BLEND_HZ: Final = 125.0
-"""And while they blend: `GAIN_UPDATE_MIN_MS` of `services.joint.drive_setpoint`."""
+"""Their rate while they blend: `GAIN_UPDATE_MIN_MS` of `services.joint.drive_setpoint`."""
 LOADCELL_FRAMES: Final = 3
-"""To a sample of the harness sensor."""
+"""Frames per sample of the harness sensor."""
 
 
 class _BusLoad(NamedTuple):
-    """Load of a bus, as shares of it."""
+    """Load of a bus, as a fraction of it."""
 
     steady: float
     blending: float
@@ -41,7 +40,7 @@ class _BusLoad(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """True if the bus carries it."""
+        """True if the bus can carry it."""
         return self.steady <= LOAD_MAX and self.blending <= BLEND_MAX
 
 
@@ -60,8 +59,8 @@ def bus_load(
 ) -> _BusLoad:
     """Return the load of a bus: per cycle, an estimate from each axis and a target to it.
 
-    Onboard, targets of the motors' own loops take 8 bytes, and their gains; else torques take 4.
-    `loadcell_rate_hz` are samples of a harness sensor on this bus.
+    Onboard, each target takes 8 bytes, and the gains come on top; else each torque takes 4.
+    `loadcell_rate_hz` is the sample rate of a harness sensor on this bus.
     """
     full, half = frame_bits(8), frame_bits(4)
     gains = full + half if onboard else 0.0
@@ -96,8 +95,8 @@ def check_buses(file: str, config: RobotConfig) -> None:
             raise ConfigError(
                 file,
                 f"can.{names[0]}",
-                f"{len(names)} modules at {service.rate_hz:g} Hz would load it to "
+                f"{len(names)} modules at {service.rate_hz:g} Hz would load the bus to "
                 f"{load.steady:.0%} of 1 Mbit/s ({load.blending:.0%} while gains blend)",
-                f"at most {LOAD_MAX:.0%} ({BLEND_MAX:.0%}): {carried} modules on a bus at this "
-                "rate, or a lower joint_service.rate_hz",
+                f"must be at most {LOAD_MAX:.0%} ({BLEND_MAX:.0%}): connect at most {carried} "
+                "modules to a bus at this rate, or lower joint_service.rate_hz",
             )

@@ -1,4 +1,4 @@
-"""Endpoints of the bus, and what is filled into them and into other texts of files."""
+"""Endpoints of the bus, and placeholders in texts of files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RUN: Final = "{run}"
 ROBOT: Final = "{robot}"
 """Placeholder of the robot's name, in `bus.security.keys`."""
 _UNIX: Final = re.compile(r"unixsock-stream/[^?#]+")
-"""Zenoh takes what follows ? or # for settings of the link, not for a part of the path."""
+"""Zenoh reads text after ? or # as settings of the link, not as part of the path."""
 _ADDRESS: Final = re.compile(
     r"(?:tcp|tls)/(\[[0-9A-Za-z:.%_-]+\]|[^\[\]:/]+):([0-9]{1,5})(?:[?#].*)?"
 )
@@ -27,7 +27,7 @@ def host_and_port(endpoint: str) -> tuple[str, int]:
     found = _ADDRESS.fullmatch(endpoint)
     if found is None or not 0 < int(found[2]) <= PORT_MAX:
         raise BusError(
-            f"{endpoint}: no host and port; tcp/HOST:PORT is right, a port from 1 to {PORT_MAX}"
+            f"{endpoint}: not a host and port; use tcp/HOST:PORT with a port from 1 to {PORT_MAX}"
         )
     return found[1].strip("[]"), int(found[2])
 
@@ -44,11 +44,11 @@ def is_endpoint(text: str) -> bool:
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:
-    """Return a text with its placeholders filled in, as `{"{run}": "/tmp/x"}` says, all at once."""
+    """Return a text with all its placeholders replaced, for example by `{"{run}": "/tmp/x"}`."""
     return _PLACEHOLDER.sub(lambda found: values.get(found[0], found[0]), text)
 
 
 def stray_braces(text: str, placeholders: Iterable[str]) -> str:
-    """Return what stands in braces and is no placeholder, such as `{Run}`; "" if nothing does."""
+    """Return the first text in braces that is not a placeholder, such as `{Run}`; else ""."""
     found = _BRACES.search(filled(text, dict.fromkeys(placeholders, "")))
     return found[0] if found else ""

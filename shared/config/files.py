@@ -1,10 +1,10 @@
-"""Reads and writes a robot file, `deploy/robot.toml`, with what stands beside it.
+"""Read and write a robot file, `deploy/robot.toml`, and the files beside it.
 
-The gain schedule, `robot.gains.json`, and the thresholds of the person who wears the robot,
-`robot.wearer.toml`, are files of their own: one follows from the robot, the other from the person.
+The gain schedule, `robot.gains.json`, and the wearer's thresholds, `robot.wearer.toml`, are files
+of their own: one follows from the robot, the other from the person.
 
-Unknown keys, wrong sizes and impossible values are refused with the file, the key, the value and
-what would be right (`shared.exceptions.ConfigError`).
+Unknown keys, wrong sizes and impossible values are refused; the error names the file, the key, the
+value and the right value (`shared.exceptions.ConfigError`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shared.toml_file import parse_toml, read_toml
 def load(path: Path) -> RobotConfig:
     """Read and check a robot file, with the gain schedule and the wearer's file beside it, if any.
 
-    Raises ConfigError if a file cannot be read, or a key or value is not as it should be.
+    Raises ConfigError if a file cannot be read, or a key or value is invalid.
     """
     config = load_without_schedule(path)
     wearer = wearer_path(path)
@@ -36,7 +36,7 @@ def load(path: Path) -> RobotConfig:
 
 
 def wearer_path(robot_file: Path) -> Path:
-    """Return the path of a robot's wearer: lab.toml -> lab.wearer.toml."""
+    """Return the path of a robot's wearer file: lab.toml -> lab.wearer.toml."""
     return robot_file.with_suffix(".wearer.toml")
 
 
@@ -60,7 +60,7 @@ def parse(text: str, file: str) -> RobotConfig:
 
 def _checked(config: RobotConfig, file: str) -> RobotConfig:
     if config.gain_schedule is not None:
-        right = "remove it: the schedule is a file of its own, made by `xrl gains`"
+        right = "remove it: the schedule is a separate file, which `xrl gains` writes"
         raise ConfigError(file, "gain_schedule", "unknown key", right)
     config_check.check(file, config)
     return config

@@ -23,7 +23,7 @@ from shared.joints import KINDS, MODULES, kind_of
 from shared.toml_file import check_ranges, read_text
 
 VERSION = 2
-"""Version of the file and of the program that makes it; a file of another version is made again."""
+"""Version of the file and of the program that makes it; `xrl gains` remakes any other version."""
 
 
 _INPUTS: Final[dict[str, tuple[str, ...]]] = {
@@ -50,8 +50,8 @@ _INPUTS: Final[dict[str, tuple[str, ...]]] = {
     "joint_service": ("k_p_max", "rate_hz", "hold_stiffens_theta"),
     "limits": KINDS,
 }
-"""Keys of each section that the schedule depends on; empty: all. Of gains and limits by kind, the
-numbers in one row."""
+"""Keys of each section on which the schedule depends; empty: all. Gains and limits by kind become
+one row of numbers."""
 
 
 def inputs_of(config: RobotConfig) -> dict[str, Any]:
@@ -67,7 +67,7 @@ def inputs_of(config: RobotConfig) -> dict[str, Any]:
                 ]
             flat[f"{section}.{key}"] = value
     if not any(config.mass.payload_com):
-        del flat["mass.payload_com"]  # younger than schedules that are still right
+        del flat["mass.payload_com"]  # schedules without this key are still right
     plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(flat))
     return plain
 
@@ -83,8 +83,8 @@ def path_beside(robot_file: Path) -> Path:
 
 
 def read(path: Path) -> GainSchedule | None:
-    """Read a schedule; None if there is no such file, ConfigError if it is not as it should be."""
-    again = "make it again: `xrl gains`"
+    """Read a schedule; None if the file is missing, ConfigError if it is invalid."""
+    again = "make it again with `xrl gains`"
     try:
         schedule = msgspec.json.decode(read_text(path), type=GainSchedule)
     except FileNotFoundError:
@@ -92,10 +92,10 @@ def read(path: Path) -> GainSchedule | None:
     except OSError as error:
         raise ConfigError(str(path), "(file)", f"cannot be read: {error}", again) from None
     except (msgspec.DecodeError, UnicodeError) as error:
-        raise ConfigError(str(path), "(file)", f"is no gain schedule: {error}", again) from None
+        raise ConfigError(str(path), "(file)", f"is not a gain schedule: {error}", again) from None
     for name, nodes in (("z", schedule.z), ("pitch", schedule.pitch)):
         if len(nodes) < 2 or any(b <= a for a, b in pairwise(nodes)):
-            raise ConfigError(str(path), name, "the nodes do not rise", again)
+            raise ConfigError(str(path), name, "the nodes do not increase", again)
     try:
         check_ranges(str(path), schedule)
     except ConfigError as error:
@@ -103,7 +103,7 @@ def read(path: Path) -> GainSchedule | None:
         raise ConfigError(error.file, error.key, error.found, expected) from None
     sizes = {len(row) for row in schedule.D}
     if len(schedule.D) != len(schedule.z) or sizes != {len(schedule.pitch)}:
-        raise ConfigError(str(path), "D", "does not fit its nodes", again)
+        raise ConfigError(str(path), "D", "does not match the nodes", again)
     if schedule.bounds is not None:
         _check_bounds(path, schedule.bounds, again)
     return schedule
@@ -113,14 +113,14 @@ def _check_bounds(path: Path, bounds: dict[str, ModuleBounds], again: str) -> No
     kinds = sorted(set(map(kind_of, MODULES)))
     if sorted(bounds) != kinds:
         found = f"are for {', '.join(sorted(bounds)) or 'nothing'}"
-        raise ConfigError(str(path), "bounds", found, f"for {', '.join(kinds)}; {again}")
+        raise ConfigError(str(path), "bounds", found, f"must be for {', '.join(kinds)}; {again}")
     for kind, row in bounds.items():
         if not (row.theta[0] < row.theta[1] and row.tau_ff):
-            raise ConfigError(str(path), f"bounds.{kind}", "theta has no parts", again)
+            raise ConfigError(str(path), f"bounds.{kind}", "theta or tau_ff is empty", again)
 
 
 def write(path: Path, schedule: GainSchedule) -> None:
-    """Write a schedule, one node a line; the file is whole or not there."""
+    """Write a schedule atomically, one node per line."""
     parts = [
         f'"{name}": {msgspec.json.encode(getattr(schedule, name)).decode()}'
         for name in GainSchedule.__struct_fields__
@@ -136,32 +136,34 @@ def write(path: Path, schedule: GainSchedule) -> None:
         replace_file(path, text.encode())
     except OSError as error:
         found = f"cannot be written: {error.strerror}"
-        raise ConfigError(str(path), "(file)", found, "a folder that you may write to") from None
+        raise ConfigError(
+            str(path), "(file)", found, "use a folder that you can write to"
+        ) from None
 
 
 def why_stale(config: RobotConfig) -> str:
     """Return why the robot's schedule does not fit the robot, in words; "" if it does."""
     schedule = config.gain_schedule
     if schedule is None:
-        return "there is no gain schedule"
+        return "the gain schedule is missing"
     if schedule.version == VERSION and config.law.lead_easing > schedule.lead_easing:
         most, asked = schedule.lead_easing, config.law.lead_easing
         return f"the gain schedule was made for law.lead_easing up to {most}, not {asked}"
     if schedule.version != VERSION:
-        return f"the gain schedule is of version {schedule.version}, not {VERSION}"
+        return f"the gain schedule has version {schedule.version}, not {VERSION}"
     inputs = inputs_of(config)
     if schedule.digest == digest_of(inputs):
         return ""
     for key, value in inputs.items():
         if schedule.inputs.get(key) != value:
             return f"the gain schedule was made for {key} = {schedule.inputs.get(key)}, not {value}"
-    return "the gain schedule's digest is not that of its inputs"
+    return "the gain schedule's digest does not match its inputs"
 
 
 def believing(config: RobotConfig) -> RobotConfig:
     """Return the robot with joint services that accept any command within their limits.
 
-    For commands that the shipped law never sends: another control, or gains under study.
+    For commands that the shipped law never sends: another controller, or gains under study.
     """
     if config.gain_schedule is None:
         return config
@@ -170,13 +172,13 @@ def believing(config: RobotConfig) -> RobotConfig:
 
 
 def require(config: RobotConfig, robot_file: Path) -> None:
-    """Refuse a robot whose gain split needs a schedule that it has not, by a ConfigError."""
+    """Raise ConfigError if the robot's gain split needs a schedule that is missing or stale."""
     if config.law.split != "certified":
         return
     stale = why_stale(config)
     schedule = config.gain_schedule
     if not stale and schedule is not None and schedule.bounds is None:
-        stale = "has no bounds by which the joint services judge commands"
+        stale = "has no bounds with which the joint services can check commands"
     if stale:
         right = f"run `xrl gains --config {shlex.quote(str(robot_file))}`"
         raise ConfigError(str(path_beside(robot_file)), "(file)", stale, right)

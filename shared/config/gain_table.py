@@ -1,4 +1,4 @@
-"""The gain schedule's own table: what `xrl gains` writes beside the robot file."""
+"""Structs of the gain schedule that `xrl gains` writes beside the robot file."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ LegDamping: TypeAlias = tuple[Damping, Damping, Damping, Damping, Damping, Dampi
 
 
 Bounds: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
-"""Least (phi, theta), largest (phi, theta)."""
+"""Minimum (phi, theta), maximum (phi, theta)."""
 
 
 class ModuleBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Between which a kind of module's commands lie, over all poses and every assist."""
+    """Bounds of the commands of one kind of module, over all poses and every assist."""
 
     k_p: Bounds
     """N m/rad; up to the stand gains and k_q_fraction_max of K_q, to which a split is stiffened."""
     k_d: Bounds
     """N m s/rad"""
     theta: tuple[float, float]
-    """rad, the joint's own: from here to there `tau_ff` goes, in equal parts."""
+    """rad; range of the joint over which `tau_ff` is given, in equal parts."""
     tau_ff: tuple[Bounds, ...]
-    """N m, by theta; both legs: phi is as far on one side as on the other."""
+    """N m, by theta, for both legs: the bounds of phi are symmetric."""
     v_ref: tuple[float, float]
     """rad/s, either way: joint rate in the body's fastest motions (`BODY_RATES`)."""
 
@@ -55,10 +55,9 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     coupling_bandwidth_hz: Annotated[float, Range(0.1, 100.0, "Hz")]
     """Bandwidth of the two poles of tau_coupled."""
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
-    """Up to this the loop is stable; less is always safe."""
+    """Maximum `law.lead_easing` with which the loop is stable; less is always safe."""
     coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
-    """What tau_coupled fills the damping up to, in shares of B_p."""
+    """Damping that the local gains and tau_coupled reach together, as a fraction of B_p."""
     bounds: dict[str, ModuleBounds] | None = None
     """By kind of module: the envelope of commands that a joint service accepts
-    (`services.joint.envelope`). None: computed by an older `xrl gains`, and not checked.
-    """
+    (`services.joint.envelope`). None: made by an older `xrl gains`; commands are not checked."""

@@ -1,9 +1,8 @@
-"""Models a bad network: delay, jitter, loss, partitions; seeded. Pure.
+"""Seeded model of a bad network: delay, jitter, loss, partitions. Pure.
 
-Terms are those of tc-netem where it has them. One class serves the modelled network of lockstep and
-the network proxy on the wire, so that both behave alike (docs/networks.md). In lockstep it acts on
-messages; on the wire it acts on Zenoh's batches: messages that are sent at once travel, and are
-lost, together.
+Terms are those of tc-netem where it has them. Lockstep's modelled network and the network proxy on
+the wire use the same class, so both behave alike (docs/networks.md). In lockstep it acts on
+messages, on the wire on Zenoh's batches: messages sent at once travel, and are lost, together.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ Ms = Annotated[float, Range(0.0, 60_000.0, "ms")]
 Distribution = Literal["uniform", "normal", "pareto"]
 
 HELD: Final = 1 << 62
-"""Release time, ns, of what waits for the end of a partition."""
+"""Release time, ns, of messages that wait for the end of a partition."""
 ROUNDING: Final = 1e-9
-"""Relative, of shares: 1 - 0.9 is not quite 0.1."""
+"""Relative tolerance of shares: 1 - 0.9 is not quite 0.1."""
 QUEUE_MAX: Final = 1000
-"""Messages that wait for a slow line; what comes on top is lost, as in netem."""
+"""Maximum number of messages that wait for a slow line; further ones are lost, as in netem."""
 
 
 class Impairment(Section, frozen=True, kw_only=True):
@@ -33,28 +32,28 @@ class Impairment(Section, frozen=True, kw_only=True):
 
     delay_ms: Ms = 0.0
     jitter_ms: Ms = 0.0
-    """uniform: delay +- jitter; normal, pareto: the standard deviation. Nothing comes before it
-    was sent: with less delay than jitter, the share that would has none."""
+    """uniform: delay +- jitter; normal, pareto: the standard deviation. A negative sum of delay and
+    jitter counts as no delay."""
     distribution: Distribution = "uniform"
     loss: Share = 0.0
-    """Probability that a message never comes."""
+    """Probability that a message is lost."""
     burst: Annotated[float, Range(1.0, 10_000.0, "messages")] = 1.0
-    """Mean length of a row of losses (a Gilbert chain); 1: each by itself."""
+    """Mean number of consecutive losses (a Gilbert chain); 1: independent losses."""
     duplicate: Share = 0.0
     """Probability that a message is duplicated; each copy has a delay of its own."""
     reorder: Share = 0.0
     """Probability that a message has no delay and so overtakes those before it."""
     rate: Annotated[float, Range(0.0, 1e10, "bytes/s")] = 0.0
-    """Bytes a second that the line carries; 0: any."""
+    """Capacity of the line; 0: unlimited."""
     ordered: bool = False
-    """A late message holds up those behind it, and a partition holds them all back until its
-    end, as on a stream (TCP); but nothing that `loss` takes is sent again. Without it:
-    overtaken and lost, as datagrams are."""
+    """True: as on a stream (TCP), a late message delays those behind it, and a partition holds all
+    back until its end; but a lost message is not sent again. False: as datagrams, messages are
+    overtaken and lost."""
     partition: bool = False
     """Nothing passes."""
 
     def describe(self) -> str:
-        """Return the impairment as `--inject` takes it: `delay=30ms loss=20%`; `nothing`."""
+        """Return the impairment as `--inject` takes it: `delay=30ms loss=20%`, or `nothing`."""
         words = [
             f"{name}={_digits(value, places)}{unit}"
             for name, value, standard, places, unit in (
@@ -78,21 +77,25 @@ class Impairment(Section, frozen=True, kw_only=True):
         late = self.delay_ms or self.jitter_ms
         alone = Impairment(partition=self.partition, ordered=self.ordered).describe()
         if self.partition and self.describe() != alone:
-            return f"{self.describe()}; in a partition nothing passes: leave out all but ordered"
+            return f"{self.describe()}; nothing passes in a partition: remove all but ordered"
         if self.ordered and self.reorder:
-            return "ordered, and reorder; on a stream nothing overtakes: leave one out"
+            return "ordered with reorder; messages on a stream cannot overtake: remove one of them"
         if self.burst > 1.0 and not 0.0 < self.loss < 1.0:
-            return f"burst {self.burst:g}, and a loss of {self.loss:g}; give a loss between 0 and 1"
+            return f"burst {self.burst:g} with a loss of {self.loss:g}; give a loss between 0 and 1"
         least = self.loss / (1.0 - self.loss) * (1.0 - ROUNDING) if self.loss < 1.0 else 1.0
         if 1.0 < self.burst < least:
-            found = f"loss {_digits(self.loss, 2)}% in rows of {self.burst:g}, and less than one"
-            return f"{found} message between them; give a burst of {math.ceil(least)} or more"
+            found = (
+                f"loss {_digits(self.loss, 2)}% in bursts of {self.burst:g} leaves less than one"
+            )
+            return f"{found} message between bursts; give a burst of {math.ceil(least)} or more"
         if self.reorder and not late:
-            return "reorder, and no delay that others could overtake; give a delay"
+            return "reorder without a delay that messages could overtake; give a delay"
         if self.distribution != "uniform" and not self.jitter_ms:
-            return f"distribution {self.distribution}, and no jitter; give a jitter"
+            return f"distribution {self.distribution} without jitter; give a jitter"
         if self.ordered and not (late or self.rate or self.partition):
-            return "ordered, and nothing late or held back; give a delay, a rate or a partition"
+            return (
+                "ordered, but nothing is delayed or held back; give a delay, a rate or a partition"
+            )
         return ""
 
 
@@ -102,7 +105,7 @@ def _digits(value: float, places: int) -> str:
 
 
 class Impairer:
-    """Decides when each message of one direction comes out, and how often; by its seed."""
+    """Seeded decision when each message of one direction comes out, and how often."""
 
     def __init__(self, what: Impairment, seed: str) -> None:
         self.what = what
@@ -116,7 +119,7 @@ class Impairer:
         self._last_ns = 0
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
-        """Take a message of some bytes in; return when it comes out, ns: never, once or twice.
+        """Take in a message of `size` bytes; return its release times, ns: none, one or two.
 
         The clock is any monotonic one.
         """
@@ -133,7 +136,7 @@ class Impairer:
         return (release_ns, self._release_ns(now_ns, size)) if twice else (release_ns,)
 
     def delays(self, now_ns: int) -> int:
-        """Return when a link's own traffic comes out, ns: in order, never lost.
+        """Return the release time of a link's own traffic, ns: in order, never lost.
 
         Such traffic opens, declares and keeps alive; it takes the mean delay. `HELD` in a
         partition.
@@ -145,7 +148,7 @@ class Impairer:
         return self._last_ns
 
     def drop(self) -> None:
-        """Count one as lost that has passed and will not come out after all: its link is gone."""
+        """Count a message that has passed as lost: its link ended before it came out."""
         self.passed -= 1
         self.lost += 1
 
@@ -199,7 +202,7 @@ class Direction:
     def __init__(self, name: str, seed: int) -> None:
         self.name = name
         self.active: Impairer | None = None
-        """What decides now; None: everything passes at once."""
+        """Active impairment; None: everything passes at once."""
         self._seed = f"{seed} {name}"
         self._asked: dict[int, Impairer] = {}
 
@@ -209,7 +212,7 @@ class Direction:
         self._choose()
 
     def end(self, number: int) -> Impairer | None:
-        """End an impairment and return it with its counts; None if it is not there."""
+        """End an impairment and return it with its counts; None if it is unknown."""
         ended = self._asked.pop(number, None)
         self._choose()
         return ended
@@ -219,7 +222,7 @@ class Direction:
         return self._asked.get(number)
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
-        """Take a message in; return when it comes out, ns. As `Impairer.passes`."""
+        """Take in a message; return its release times, ns. As `Impairer.passes`."""
         return (now_ns,) if self.active is None else self.active.passes(now_ns, size)
 
     def _choose(self) -> None:

@@ -15,21 +15,21 @@ from shared.toml_file import Section
 SERVICES = ("planner", "harness", "imu", "recorder", "simulator", *MODULES)
 """Every service that a fleet can have; each has an endpoint on the bus."""
 OPTIONAL = ("imu",)
-"""Those that not every robot has: `RobotConfig.services`."""
+"""Services that not every robot has (`RobotConfig.services`)."""
 
 ENDPOINTS_OF_MODE = {
     "local": ("unixsock-stream/",),
     "mtls": ("tls/",),
     "open": ("unixsock-stream/", "tcp/"),
 }
-"""What the bus's endpoints begin with under each `bus.security.mode` (docs/security.md)."""
+"""Prefixes of the bus's endpoints under each `bus.security.mode` (docs/security.md)."""
 
 GRAVITY = 9.81
 """m/s^2"""
 
 
 class RobotConfig(Section, frozen=True):
-    """The whole file."""
+    """The whole robot file."""
 
     name: str
     assumed: tuple[str, ...]
@@ -60,7 +60,7 @@ class RobotConfig(Section, frozen=True):
     park: sections.ParkConfig = sections.ParkConfig()
     ros2: sections.Ros2Config = sections.Ros2Config()
     gain_schedule: GainSchedule | None = None
-    """Not in this file but beside it; None if it has not been made."""
+    """From the file beside this one; None if it is missing."""
 
     @property
     def services(self) -> tuple[str, ...]:
@@ -78,7 +78,7 @@ class RobotConfig(Section, frozen=True):
         return next(module for module in self.module if module.name == name)
 
     def motor_signs(self) -> tuple[int, ...]:
-        """Return which way each of the 12 motors counts, axis0 and axis1 of each module."""
+        """Return the counting direction of the 12 motors, axis0 and axis1 of each module."""
         return tuple(s for name in MODULES for s in self.module_named(name).motor_signs)
 
     def joint_limits(self) -> tuple[tuple[float, float], ...]:
@@ -95,18 +95,18 @@ class RobotConfig(Section, frozen=True):
         return gains
 
     def hold_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return (k_p, k_d) that a module's gains rise to where no tau_coupled holds it.
+        """Return (k_p, k_d) to which a module's gains rise where no tau_coupled holds it.
 
-        The stand gains of ankles, knees and every phi, zero elsewhere; (phi, theta), N m/rad and
-        N m s/rad. With the commanded gains unchanged the operator's 60 N m of pitch
-        moment in the crawl leaned the COM back by 42 mm and the soles tipped, and pushes from the
-        side tipped them in 15 of 500 random cases. With the knees' theta soft, one leg gave under a
-        lasting push from the side: 25 N for 3 s stood, now 75 N. The hips' theta stays soft: a
-        torso that does not follow a hand that leads on hands all of its moment to the soles, and
-        6 of 300 fell.
+        The stand gains of ankles, knees and every phi, zero elsewhere; (phi, theta), N m/rad and N
+        m s/rad. With the commanded gains unchanged, the operator's 60 N m of pitch moment in the
+        crawl leaned the COM back by 42 mm and the soles tipped. Pushes from the side tipped them in
+        15 of 500 random cases. With the knees' theta soft, one leg gave under a lasting push from
+        the side: it stood 25 N for 3 s, with stiff ones 75 N. The hips' theta stays soft: a stiff
+        torso passes all the moment of a hand that keeps leading to the soles, and 6 of 300 fell.
 
-        In TRACK without tau_coupled the same: the certified gains are stiff enough to stand, but
-        sway damped by 0.055 only; two pushes of 40 N from the side, 2 s apart, made it fall.
+        TRACK without tau_coupled uses the same gains. The certified gains are stiff enough to
+        stand, but damp sway by 0.055 only: two pushes of 40 N from the side, 2 s apart, made it
+        fall.
         """
         stand = self.stand_gains(module)
         theta = float(kind_of(module) in self.joint_service.hold_stiffens_theta)
@@ -115,8 +115,8 @@ class RobotConfig(Section, frozen=True):
     def support_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return (k_p, k_d) of a module that stiffens because another one is limp.
 
-        The stand gains; a hip's theta holds the torso on a leg that is a strut, with
-        `joint_service.limp_leg_hip_theta`; (phi, theta), N m/rad and N m s/rad.
+        The stand gains, except a hip's theta: `joint_service.limp_leg_hip_theta` holds the torso on
+        a leg that is a strut. (phi, theta), N m/rad and N m s/rad.
         """
         stand = self.stand_gains(module)
         if kind_of(module) != "hip":
@@ -131,7 +131,7 @@ class RobotConfig(Section, frozen=True):
 
     @property
     def torso_com(self) -> tuple[float, float, float]:
-        """Centre of mass of torso and payload, m, torso axes: of all else it is 0."""
+        """Centre of mass of torso and payload, m, torso axes; without payload it is 0."""
         fraction = self.mass.payload / self.torso_mass
         x, y, z = self.mass.payload_com
         return fraction * x, fraction * y, fraction * z
@@ -150,9 +150,9 @@ class RobotConfig(Section, frozen=True):
 def expand(text: str, run_dir: Path) -> str:
     """Return a path or endpoint with `{run}` replaced by the live directory of a run directory.
 
-    Raises BusError if something else stands in braces; it would be taken as it is.
+    Raises BusError for any other text in braces, which would be used as it is.
     """
     stray = stray_braces(text, [RUN])
     if stray:
-        raise BusError(f"{text}: {stray} is no placeholder; only {RUN} is filled in")
+        raise BusError(f"{text}: {stray} is not a valid placeholder; only {RUN} is replaced")
     return filled(text, {RUN: str(live_dir(run_dir))})

@@ -1,4 +1,4 @@
-"""What happens in a run: the operator's hand, pushes, kills, restarts and drives' faults.
+"""Events of a run: the operator's hand, pushes, kills, restarts and drive faults.
 
 A scenario is a TOML file (`deploy/scenarios/`); `xrl demo` adds to it from its flags.
 """
@@ -34,7 +34,7 @@ SIGNALS = ("KILL", "STOP", "TERM", "INT")
 
 
 class Keyframe(Section, frozen=True):
-    """Where the operator's hand leads at a moment; cosine-eased to the next keyframe."""
+    """Target of the operator's hand at one time; cosine-eased to the next keyframe."""
 
     at: Time
     height: Annotated[float, Range(0.3, 2.0, "m")]
@@ -42,15 +42,15 @@ class Keyframe(Section, frozen=True):
     assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
     """Weight that the operator rests on the harness and asks the robot to carry, N."""
     shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
-    """Where the operator asks COM x and y, m, and the torso's roll and yaw, rad, to be."""
+    """Requested offset of COM x and y, m, and of the torso's roll and yaw, rad."""
     side: ShiftLength | None = None
-    """Where the person holds the harness point sideways, m, world y: between two keyframes that say
-    so, before the first and after the last if that says so; else they leave it free. It begins near
-    0, where the robot stands: nothing eases the grip."""
+    """World y at which the person holds the harness point, m: between two keyframes that set it,
+    and before the first and after the last if that sets it; else it is free. Begin near 0, where
+    the robot stands: nothing eases the grip."""
 
 
 class Push(Section, frozen=True):
-    """A force on the torso for a while, world axes."""
+    """Force on the torso for a limited time, N, world axes."""
 
     at: Time
     duration: Annotated[float, Range(0.001, 60.0, "s")]
@@ -58,7 +58,7 @@ class Push(Section, frozen=True):
 
 
 class Act(Section, frozen=True):
-    """What the person does beside leading, without asking the robot for anything.
+    """Act of the person besides leading, without a request to the robot.
 
     rest: puts weight on the harness; relax: the same, and the hand holds with a quarter of its
     strength; limp: the same, and the hand holds nothing; bump: a blow, half a sine; pull: along x;
@@ -71,13 +71,13 @@ class Act(Section, frozen=True):
     force: Force = 0.0
     """N; down for a weight, up for a bump, forwards for a pull."""
     ramp: Annotated[float, Range(0.0, 60.0, "s")] = 0.2
-    """Time in which it comes, s; a bump has none."""
+    """Rise time, s; not for a bump."""
     release: Annotated[float, Range(0.0, 60.0, "s")] | None = None
-    """Time in which it goes, s; by default as `ramp`."""
+    """Fall time, s; by default as `ramp`."""
 
 
 class Kill(Section, frozen=True):
-    """A signal to a service. It stays down until a `Restart` names it."""
+    """Signal to a service, which stays down until a `Restart` names it."""
 
     service: str
     at: Time
@@ -85,7 +85,7 @@ class Kill(Section, frozen=True):
 
 
 class Restart(Section, frozen=True):
-    """Starts a killed service again, or continues a stopped one."""
+    """Restart of a killed service, or continuation of a stopped one."""
 
     service: str
     at: Time
@@ -119,29 +119,31 @@ class _FaultTraits(NamedTuple):
 
 
 FAULT_KINDS: Final[Mapping[str, _FaultTraits]] = {
-    "over_temperature": _FaultTraits("an output stage too hot", 5.0, whole=False),
-    "over_voltage": _FaultTraits("the supply too high", 0.1, whole=True),
-    "encoder": _FaultTraits("an encoder sends no more words", 5.0, whole=False),
+    "over_temperature": _FaultTraits("an output stage is too hot", 5.0, whole=False),
+    "over_voltage": _FaultTraits("the supply voltage is too high", 0.1, whole=True),
+    "encoder": _FaultTraits("an encoder stops sending words", 5.0, whole=False),
     "watchdog": _FaultTraits("an axis's watchdog fires", None, whole=False),
-    "link_lost": _FaultTraits("the cable out: nothing sent, nothing heard", 0.5, whole=True),
+    "link_lost": _FaultTraits(
+        "the cable is disconnected: nothing is sent or received", 0.5, whole=True
+    ),
     "disarmed": _FaultTraits("an axis goes idle without an error", None, whole=False),
-    "overspeed": _FaultTraits("an axis disarms for its speed", None, whole=False),
-    "brown_out": _FaultTraits("no power, then a restart", 0.2, whole=True),
+    "overspeed": _FaultTraits("an axis disarms because it is too fast", None, whole=False),
+    "brown_out": _FaultTraits("the drive loses power, then restarts", 0.2, whole=True),
     "encoder_zero": _FaultTraits("an encoder reads 0, which is a valid word", 5.0, whole=False),
     "encoder_gap": _FaultTraits(
-        "a gap in an encoder's words, too short for an error", 0.045, whole=False
+        "an encoder's words have a gap, too short for an error", 0.045, whole=False
     ),
-    "no_ack": _FaultTraits("it sends, and hears and acknowledges nothing", 0.5, whole=True),
+    "no_ack": _FaultTraits("it sends, but receives and acknowledges nothing", 0.5, whole=True),
     "bus_full": _FaultTraits(
-        "its bus's send queue full for 40 ms of each 100 ms (ENOBUFS)", 2.0, whole=True
+        "its bus's send queue is full for 40 ms of each 100 ms (ENOBUFS)", 2.0, whole=True
     ),
-    "bus_flap": _FaultTraits("its bus dead for 60 ms of each 150 ms", 2.0, whole=True),
+    "bus_flap": _FaultTraits("its bus is dead for 60 ms of each 150 ms", 2.0, whole=True),
 }
 """Faults by name. An axis that disarms floats; its sibling keeps its torque."""
 
 
 class Fault(Section, frozen=True):
-    """Something goes wrong in a module's ODrive."""
+    """Fault of a module's ODrive."""
 
     module: str
     kind: FaultKind
@@ -158,7 +160,7 @@ class Fault(Section, frozen=True):
 
 
 class Inject(Impairment, frozen=True, kw_only=True):
-    """The network does something to a link for a while."""
+    """Impairment of a link for a limited time."""
 
     link: str
     """One or several directions (`shared.links`), such as `planner->joints`."""
@@ -168,12 +170,12 @@ class Inject(Impairment, frozen=True, kw_only=True):
 
     @property
     def until(self) -> float:
-        """When it ends, s; infinite if it does not."""
+        """End, s; infinite if it does not end."""
         return math.inf if self.duration is None else self.at + self.duration
 
 
 class Scenario(Section, frozen=True):
-    """The whole file."""
+    """The whole scenario file."""
 
     name: str
     about: str
@@ -190,11 +192,11 @@ class Scenario(Section, frozen=True):
 
 
 SCENARIO: Final = "the scenario"
-"""Source of the intents that a scenario asks for."""
+"""Source of a scenario's intents."""
 
 
 class Lead(NamedTuple):
-    """The operator's request at a time."""
+    """Operator's request at one time."""
 
     height: float
     """m, torso origin above the ankles."""
@@ -211,7 +213,7 @@ class Lead(NamedTuple):
 
 
 def lead(scenario: Scenario, t: float) -> Lead:
-    """Return where the hand leads at scenario time t (s); before 0, the first keyframe."""
+    """Return the hand's target at scenario time t, s; before 0, the first keyframe."""
     frames = scenario.keyframe
     for a, b in pairwise(frames):
         if frames[0].at < t < b.at:
@@ -265,7 +267,7 @@ def load(path: Path) -> Scenario:
 
 
 def check(file: str, scenario: Scenario) -> None:
-    """Check what no single value shows: order, services, times inside the run."""
+    """Check values against each other: order, services, times inside the run."""
     check_ranges(file, scenario)
     for index, inject in enumerate(scenario.inject):
         directions_of(inject.link, file, f"inject[{index}].link")
@@ -274,27 +276,31 @@ def check(file: str, scenario: Scenario) -> None:
 
 
 def _problems(scenario: Scenario) -> Iterator[tuple[str, str, str]]:
-    """Yield the key, what stands there and what would be right."""
+    """Yield the key, the found value and the right value of each problem."""
     if not scenario.keyframe:
-        yield "keyframe", "none", "at least one [[keyframe]]"
+        yield "keyframe", "missing", "add at least one [[keyframe]]"
     for index, (a, b) in enumerate(pairwise(frame.at for frame in scenario.keyframe)):
         if b <= a:
-            found = f"at {b:g} s does not follow {a:g} s"
-            yield f"keyframe[{index + 1}].at", found, "times must rise"
+            found = f"{b:g} s is not later than {a:g} s"
+            yield f"keyframe[{index + 1}].at", found, "times must increase"
     for kind in ("kill", "restart", "push", "act", "fault", "inject"):
         rows: Sequence[Kill | Restart | Push | Act | Fault | Inject] = getattr(scenario, kind)
         for index, row in enumerate(rows):
             where = f"{kind}[{index}]"
             if isinstance(row, Kill | Restart) and row.service not in SERVICES:
-                yield f"{where}.service", f"{row.service!r}", f"one of {', '.join(SERVICES)}"
+                yield (
+                    f"{where}.service",
+                    f"{row.service!r} is not valid",
+                    f"use one of {', '.join(SERVICES)}",
+                )
             if isinstance(row, Fault):
                 yield from _fault_problems(where, row)
             if isinstance(row, Inject) and (problem := row.fault()):
                 found, _, right = problem.partition("; ")
                 yield where, found, right
             if row.at >= scenario.duration:
-                found = f"{row.at:g} s is not inside the run of {scenario.duration:g} s"
-                yield f"{where}.at", found, "an earlier time, or a longer duration"
+                found = f"{row.at:g} s is not before the end of the run, {scenario.duration:g} s"
+                yield f"{where}.at", found, "use an earlier time or a longer duration"
     for index, restart in enumerate(scenario.restart):
         if not any(k.service == restart.service and k.at < restart.at for k in scenario.kill):
             found = f"{restart.service} is not killed before {restart.at:g} s"
@@ -303,16 +309,20 @@ def _problems(scenario: Scenario) -> Iterator[tuple[str, str, str]]:
 
 def _fault_problems(where: str, fault: Fault) -> Iterator[tuple[str, str, str]]:
     if fault.module not in MODULES:
-        yield f"{where}.module", f"{fault.module!r}", f"one of {', '.join(MODULES)}"
+        yield (
+            f"{where}.module",
+            f"{fault.module!r} is not valid",
+            f"use one of {', '.join(MODULES)}",
+        )
     traits = FAULT_KINDS[fault.kind]
     if fault.axis not in (None, 0, 1):
-        yield f"{where}.axis", f"{fault.axis}", "0 or 1"
+        yield f"{where}.axis", f"{fault.axis} is not an axis", "must be 0 or 1"
     if fault.axis is not None and traits.whole:
-        found = f"{fault.axis}, but {fault.kind} is of the whole ODrive"
-        yield f"{where}.axis", found, "leave it out"
+        found = f"{fault.axis}, but {fault.kind} affects the whole ODrive"
+        yield f"{where}.axis", found, "remove it"
     if fault.duration is not None and traits.duration is None:
-        found = f"{fault.duration:g} s, but {fault.kind} is of a moment"
-        yield f"{where}.duration", found, "leave it out"
+        found = f"{fault.duration:g} s, but {fault.kind} is momentary"
+        yield f"{where}.duration", found, "remove it"
     if fault.duration is not None and not 0.001 <= fault.duration <= 600.0:
         found = f"{fault.duration!r} is out of range"
         yield f"{where}.duration", found, "must be from 0.001 to 600 s"

@@ -1,4 +1,4 @@
-"""The tables of `deploy/robot.toml` as typed structs; `robot_config` puts them together."""
+"""Tables of `deploy/robot.toml` as typed structs; `robot_config` combines them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ class MassConfig(Section, frozen=True):
     battery: Mass
     payload: Mass
     payload_max: Mass
-    """The largest `payload` that the file may name."""
     payload_com: tuple[PayloadPlace, PayloadPlace, PayloadPlace] = (0.0, 0.0, 0.0)
-    """Centre of the payload, m, torso axes, from the torso's origin."""
 
 
 class GeometryConfig(Section, frozen=True):
@@ -54,7 +52,7 @@ class JointConfig(Section, frozen=True):
 
 
 class LimitConfig(Section, frozen=True):
-    """Joint range of one kind of module, and why it is so."""
+    """Joint range of one kind of module, with its reason."""
 
     phi: tuple[Angle, Angle]
     theta: tuple[Angle, Angle]
@@ -70,16 +68,16 @@ class LimitsConfig(Section, frozen=True):
 
 
 class ModuleConfig(Section, frozen=True):
-    """One module: which bus and which two CAN nodes, or which ODrive on USB."""
+    """One module: its bus and two CAN nodes, or its ODrive on USB."""
 
     name: str
     bus: str
     node_ids: tuple[Annotated[int, Range(0, 62, "1")], Annotated[int, Range(0, 62, "1")]]
     motor_signs: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, 1)
-    """-1: that motor counts down where the differential's equations have it count up."""
+    """-1: this motor counts against the differential's equations."""
     serial_number: str = ""
-    """12 hexadecimal digits, as USB shows them: for the driver over USB, and for what `xrl drive`
-    and `xrl doctor` read or write there."""
+    """USB serial number, 12 hexadecimal digits; for the USB driver, `xrl drive` and `xrl
+    doctor`."""
 
 
 LinearStiffness = Annotated[float, Range(0.0, 1e5, "N/m")]
@@ -117,9 +115,9 @@ class LawConfig(Section, frozen=True):
     recentre_s: Seconds
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
     push_integral_s: Annotated[float, Range(0.1, 100.0, "s")] = 1.0
-    """Time in which a force of K_p times the error grows against a push from the side."""
+    """Time in which the force against a lasting push from the side grows by K_p times the error."""
     push_integral_max: Annotated[float, Range(0.0, 200.0, "N")] = 0.0
-    """Most of that force; HOLD drops it, and must stand the step."""
+    """Maximum of that force; HOLD drops it, so the robot must stand the step."""
     shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     load_correction: tuple[
@@ -136,7 +134,7 @@ RequiredStiffness6 = tuple[
 
 
 class CertificateConfig(Section, frozen=True):
-    """What local gains must hold alone (docs/law.md#gain-split and docs/law.md#certificate)."""
+    """Requirements on local gains alone (docs/law.md#gain-split and docs/law.md#certificate)."""
 
     K_required: RequiredStiffness6
     onboard_fraction: Share
@@ -146,22 +144,20 @@ class CertificateConfig(Section, frozen=True):
 
 
 class RobustnessConfig(Section, frozen=True):
-    """Errors that the loop must be stable with (the dynamic certificate)."""
+    """Model errors with which the loop must be stable (dynamic certificate)."""
 
     stiffness: tuple[Annotated[float, Range(500.0, 1e6, "N m/rad")], ...]
-    """Stiffnesses of the drivetrain between motor and joint that the loop must be stable with; 1e6
-    is rigid."""
+    """Drivetrain stiffnesses between motor and joint; 1e6 is rigid."""
     damping_s: Annotated[float, Range(0.0, 0.1, "s")]
-    """Damping of the drivetrain, N m s/rad per N m/rad."""
+    """Drivetrain damping, N m s/rad per N m/rad."""
     torque_lag_ms: Annotated[float, Range(0.05, 20.0, "ms")]
     """First-order lag of the drives' torque."""
     delay_ms: Annotated[float, Range(1.0, 100.0, "ms")]
-    """From a state's sample to the first use of its command."""
     delay_margin: Annotated[float, Range(1.0, 10.0, "1")]
     gain_margin: Annotated[float, Range(1.0, 10.0, "1")]
     drift_max: Annotated[float, Range(0.0, 10.0, "1/s")]
-    """A motion without oscillation along a led direction may grow at this rate: with the encoder
-    at the motor, the weight's feedforward follows the motor and not the joint."""
+    """Maximum growth rate of a motion without oscillation along a led direction: the weight's
+    feedforward follows the motor, where the encoder is, not the joint."""
     hands: tuple[
         tuple[
             Annotated[float, Range(0.0, 1e5, "N/m")],
@@ -171,7 +167,7 @@ class RobustnessConfig(Section, frozen=True):
         ],
         ...,
     ]
-    """(k_z, b_z, k_pitch, b_pitch) of hands at the harness, the lightest first."""
+    """(k_z, b_z, k_pitch, b_pitch) of hands at the harness, lightest first."""
 
 
 class AssistConfig(Section, frozen=True):
@@ -186,18 +182,15 @@ class AssistConfig(Section, frozen=True):
 
 
 class WearerThresholds(Section, frozen=True):
-    """What differs between the persons who wear a robot; `xrl log wearer` measures it."""
+    """Thresholds of one wearer; `xrl log wearer` measures them."""
 
     open_n: Annotated[float, Range(10.0, 100.0, "N")] = 22.0
-    """Net pull up that opens it; the peak of a led squat."""
     open_back_nm: Annotated[float, Range(2.0, 50.0, "N m")] = 6.0
-    """Moment backwards that opens it."""
     still_s: Annotated[float, Range(0.1, 5.0, "s")] = 1.0
-    """Time for which it must be still before it parks."""
 
 
 class ParkConfig(WearerThresholds, frozen=True):
-    """Lets a person rest on a robot that stands still, crouched (docs/law.md#park)."""
+    """Parking: a person may rest on a crouched robot that stands still (docs/law.md#park)."""
 
     enabled: bool = False
 
@@ -253,50 +246,38 @@ class JointServiceConfig(Section, frozen=True):
     k_d_max: LocalDamping
     v_max: Annotated[float, Range(0.1, 100.0, "rad/s")]
     pendant_ms: Annotated[float, Range(20.0, 10_000.0, "ms")] = 500.0
-    """Silence of a pendant that is an emergency stop, once the pendant was there."""
     fallen_k_d: LocalDamping = 20.0
-    """Damping of all twelve axes once the robot has fallen; nothing else is left then."""
     limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
-    """Gains of each hip's theta while a knee is limp: its leg stands as a strut on them."""
+    """Gains of the hips' theta while a knee is limp and its leg stands as a strut."""
     stiffen_ms: Milliseconds = 300.0
-    """In HOLD, and beside a limp module: the rise of the gains. Within 300 ms, leaned on from the
-    side while led, it fell from 10 N less on."""
+    """Rise time of the gains in HOLD and beside a limp module. At 300 ms a led robot, leaned on
+    from the side, fell at 10 N less."""
 
 
 class EnvelopeConfig(Section, frozen=True):
     """Envelope of accepted commands, beyond `GainSchedule.bounds`."""
 
     tau_ff_margin: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
-    """Feedforward beyond the bounds of straight stands: leans, slopes and other stances."""
     q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
-    """Largest distance of the reference from the joint."""
     q_ref_astray: Annotated[float, Range(0.001, 2.0, "rad")] = 0.04
-    """Farthest an ankle's reference may go another way than its rate says, within half a second.
-    The law's goes 0.3 mrad while a person leads, and 20 while the height has a reference of its
-    own."""
+    """Maximum deviation of an ankle's reference from its rate, within half a second. The law's: 0.3
+    mrad while a person leads, 20 mrad while the height follows its own reference."""
     spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 40.0
-    """Largest k_p times that distance."""
     hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 300.0
-    """Most torque that HOLD's stiffening adds; an axis farther from its reference holds its
-    position."""
     tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
-    """Largest coupled torque."""
     coupled_work: Annotated[float, Range(0.01, 1e3, "J")] = 1.0
-    """Work of the coupled torque against the joint's way to its reference. The law's is 0.1 J on
-    drawn plants pushed as hard as soles and motors bear, and 0.6 J in a fall."""
+    """Maximum work of the coupled torque against the joint's way to its reference. The law's: 0.1 J
+    on drawn plants pushed as hard as soles and motors bear, 0.6 J in a fall."""
     coupled_energy: Annotated[float, Range(0.01, 1e3, "J")] = 10.0
-    """Work of the coupled torque on a module's moving joints, within some 0.3 s. The law's is 2 J
-    on drawn plants pushed with 75 % of what soles and motors bear, and 6 J when a hand of 150 N
+    """Maximum work of the coupled torque on a module's moving joints within about 0.3 s. The law's:
+    2 J on drawn plants pushed with 75 % of what soles and motors bear, 6 J when a hand of 150 N
     leads up."""
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
-    """Largest rate of the feedforward."""
     v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0
-    """Largest rate of the reference where a pose's own bound is larger: straight knees turn ever
-    faster."""
+    """Maximum rate of the reference where a pose's own bound is larger: nearly straight knees turn
+    fast."""
     torque_step: Annotated[float, Range(0.0, 100.0, "N m")] = 1.0
-    """Torque step from one command to the next, plus `torque_rate` times the time between them."""
     torque_rate: Annotated[float, Range(1.0, 1e5, "N m/s")] = 1000.0
-    """Rate of the torque between two commands; see `torque_step`."""
 
 
 class TripLimit(Section, frozen=True):
@@ -305,11 +286,11 @@ class TripLimit(Section, frozen=True):
     limit: Annotated[float, Range(0.0, 1e4, "the trip's own unit")]
     """Value beyond which it trips."""
     after_ms: Annotated[float, Range(0.0, 1e4, "ms")] = 0.0
-    """Time beyond the limit, without a break, before it trips."""
+    """Time continuously beyond the limit before it trips."""
 
 
 class TripsConfig(Section, frozen=True):
-    """Trips: limits that take the robot out of being led (docs/reference/faults.md)."""
+    """Limits beyond which the robot holds and is no longer led (docs/reference/faults.md)."""
 
     shaking: TripLimit = TripLimit(limit=15.0)
     torque_limit: TripLimit = TripLimit(limit=1.0, after_ms=1000.0)
@@ -332,20 +313,18 @@ Celsius = Annotated[float, Range(-40.0, 200.0, "C")]
 
 
 class HeatConfig(Section, frozen=True):
-    """What motors and output stages are, to estimate how warm they get (docs/results.md)."""
+    """Thermal model of motors and output stages (docs/results.md)."""
 
     estimate: bool = False
-    """False: nothing is known of them, nothing estimated, and the robot stands up for no heat."""
+    """False: no temperature is estimated, and the robot does not stand up for heat."""
     ambient: Celsius = 40.0
-    """Air at the robot on the hottest day."""
     winding_max: Celsius = 95.0
-    """No winding is to be warmer: below the insulation's class by what the estimate may be off, and
-    5 C below the `temp_limit_lower` of a motor's thermistor: to stand up against a hand that clings
-    adds 2 C."""
+    """Maximum winding temperature: below the insulation class by the estimate's error, and 5 C
+    below the `temp_limit_lower` of a motor thermistor. Standing up against a clinging hand adds 2
+    C."""
     stage_max: Celsius = 90.0
-    """No output stage is to be warmer: below the drives' `temp_limit_lower`."""
+    """Maximum output stage temperature, below the drives' `temp_limit_lower`."""
     resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = 0.1
-    """Resistance of a phase at 25 C; the drive's calibration finds it (`phase_resistance`)."""
     winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
     winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5
     housing_capacity: Annotated[float, Range(1.0, 1e5, "J/K")] = 1500.0
@@ -355,9 +334,7 @@ class HeatConfig(Section, frozen=True):
     stage_s: Annotated[float, Range(1.0, 1e4, "s")] = 200.0
     """Time constant of the output stages."""
     ease_s: Annotated[float, Range(5.0, 600.0, "s")] = 60.0
-    """Seconds left at this load below which the assist goes, and the person is told."""
     stand_s: Annotated[float, Range(5.0, 600.0, "s")] = 30.0
-    """Seconds left below which the robot moves to where it stays cooler by itself."""
 
 
 class PlannerConfig(Section, frozen=True):
@@ -389,57 +366,53 @@ class ImuConfig(Section, frozen=True):
     """IMU on the torso, for floors that slope (docs/law.md#slopes)."""
 
     fitted: bool = False
-    """True if the robot has one; without it the floor is taken as level."""
+    """True if fitted; without an IMU the floor counts as level."""
     bus: str = "imu"
     rate_hz: Rate = 100.0
-    """Rate of the sensor's samples and of the service's cycles."""
+    """Rate of samples and of the service's cycles."""
     mounting: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
-    """Roll, pitch and yaw of the sensor on the torso, rad: R = Rz(yaw) Rx(roll) Ry(pitch)."""
+    """Roll, pitch and yaw of the sensor on the torso: R = Rz(yaw) Rx(roll) Ry(pitch)."""
     stale_ms: Milliseconds = 100.0
-    """Age beyond which a sample is ignored; the slope stays."""
     levelling_s: Annotated[float, Range(0.05, 60.0, "s")] = 1.0
-    """Time constant of the slope."""
 
 
 class Ros2Config(Section, frozen=True):
-    """Gateway to ROS 2, a process of its own that publishes what the robot does (docs/ros2.md)."""
+    """Gateway process that publishes to ROS 2; rate 0: not published (docs/ros2.md)."""
 
     router: str = "tcp/localhost:7447"
-    """Endpoint of the Zenoh router of the ROS 2 network (`rmw_zenohd`)."""
+    """Zenoh router of the ROS 2 network (`rmw_zenohd`)."""
     distribution: str = "jazzy"
-    """Distribution of that network: jazzy, kilted or lyrical."""
+    """Its distribution: jazzy, kilted or lyrical."""
     namespace: str = ""
-    """Namespace of the topics, and what the names of the frames begin with; such as `legs`."""
+    """Namespace of the topics and prefix of the frame names, such as `legs`."""
     joint_states_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
-    """Rate of `joint_states`; 0: not published."""
+    """Rate of `joint_states`."""
     tf_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 30.0
-    """Rate of `/tf`; 0: not published."""
+    """Rate of `/tf`."""
     wrench_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
-    """Rate of `harness/wrench`; 0: not published."""
+    """Rate of `harness/wrench`."""
     diagnostics_hz: Annotated[float, Range(0.0, 10.0, "Hz")] = 1.0
-    """Rate of `/diagnostics`; 0: not published."""
+    """Rate of `/diagnostics`."""
     clock_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
-    """Rate of `/clock`, of a simulated robot only; 0: not published."""
+    """Rate of `/clock`, for a simulated robot only."""
 
 
 SupplyVoltage = Annotated[float, Range(0.0, 100.0, "V")]
 
 
 class SupplyConfig(Section, frozen=True):
-    """Levels of the drives' supply; 0: never (docs/drives.md)."""
+    """Voltage thresholds of the drives' supply; 0: off (docs/drives.md)."""
 
     low_v: SupplyVoltage = 0.0
-    """Below it the person is told."""
     sit_v: SupplyVoltage = 0.0
-    """Below it a robot that is led goes down by itself, if its supply was once above `low_v`: well
-    above `config.dc_bus_undervoltage_trip_level` of the drives, and above what the battery's own
-    electronics switch off at."""
+    """Below it a led robot goes down on its own, if its supply was once above `low_v`. Set it well
+    above the drives' `config.dc_bus_undervoltage_trip_level` and above the battery's own
+    cut-off."""
 
 
 LOST_S: Final = 0.1
 """Silence after which a drive without a watchdog is lost, s. In DAMP a knee holds beside any module
-of its host that has been silent for that time, whatever the watchdog
-(`services.joint.neighbours`)."""
+of its host that was silent for this time, whatever the watchdog (`services.joint.neighbours`)."""
 
 
 class DriveConfig(Section, frozen=True):
@@ -454,34 +427,35 @@ class DriveConfig(Section, frozen=True):
     heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
     zero_mark_turns: Annotated[float, Range(0.0, 4096.0, "turns")]
     encoder_bandwidth: Annotated[float, Range(100.0, 8000.0, "rad/s")] = 2000.0
-    """Bandwidth of the drives' estimate of position and velocity."""
+    """Bandwidth of the drives' position and velocity estimate."""
 
     @property
     def lost_after_s(self) -> float:
         """Silence after which a drive is lost, s.
 
-        Not before its own watchdog has fired: until then a silent drive holds its last torque and
-        comes back as if nothing had been, while a FAULT is for good.
+        At least its watchdog's timeout: until then a silent drive holds its last torque and can
+        come back unharmed, while a FAULT is permanent.
         """
         return self.watchdog_timeout or LOST_S
 
 
 class CanConfig(Section, frozen=True):
-    """A CAN bus as python-can takes it."""
+    """CAN bus in python-can's terms."""
 
     interface: str
     channel: str
 
 
 class BusSecurityConfig(Section, frozen=True):
-    """Who may link to the bus (docs/security.md)."""
+    """Access to the bus (docs/security.md)."""
 
     mode: Literal["local", "mtls", "open"] = "local"
-    """UNIX sockets of this user; TLS by certificates on both sides; anyone who reaches a port."""
+    """local: UNIX sockets of this user; mtls: TLS with certificates on both sides; open: anyone who
+    reaches a port."""
     keys: str = "~/.config/xrl/{robot}/keys"
-    """Folder of this host's certificates and keys, for `mtls`: `xrl keys pack` fills it."""
+    """Folder of this host's certificates and keys for `mtls`; `xrl keys pack` fills it."""
     allow: tuple[str, ...] = ()
-    """Under `mtls`: who may begin a link beside the hosts of the endpoints, such as laptops."""
+    """For `mtls`: hosts that may link besides those of the endpoints, such as laptops."""
 
 
 class BusConfig(Section, frozen=True):
@@ -499,11 +473,8 @@ class RecorderConfig(Section, frozen=True):
     flush_ms: Milliseconds
     fsync_s: Seconds
     split_s: Annotated[float, Range(0.0, 86_400.0, "s")] = 0.0
-    """Time after which the next file begins; 0: never."""
     split_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 1024
-    """Size at which the next file begins; 0: never."""
     free_min_mib: Annotated[int, Range(0, 1 << 20, "MiB")] = 256
-    """Recording stops while less of the disk is free; 0: only when it is full."""
 
 
 class OperatorConfig(Section, frozen=True):
@@ -516,10 +487,9 @@ class OperatorConfig(Section, frozen=True):
     b_pitch: Annotated[float, Range(0.0, 1e4, "N m s/rad")]
     moment_max: Annotated[float, Range(0.0, 1e4, "N m")]
     k_y: Annotated[float, Range(0.0, 1e5, "N/m")] = 1500.0
-    """Sideways, where a scenario holds the harness point (`side`)."""
     b_y: Annotated[float, Range(0.0, 1e4, "N s/m")] = 150.0
     soft_n: Annotated[float, Range(0.0, 1e4, "N")] = 0.0
-    """N; a harness that softens as it is stretched gives no more along z. 0: it is linear."""
+    """Maximum spring force along z of a harness that softens; 0: linear."""
 
 
 class SimulationConfig(Section, frozen=True):
@@ -534,4 +504,4 @@ class SimulationConfig(Section, frozen=True):
     late_slip_ms: Milliseconds
     operator: OperatorConfig
     can_dialect: Literal["0.5", "0.6"] = "0.5"
-    """Firmware whose CANSimple the emulated drives speak; the services find out by themselves."""
+    """Firmware whose CANSimple the emulated drives speak; the services detect it."""

@@ -1,1 +1,1 @@
-"""Logs: MCAP files written, read though cut off or damaged, recovered, and extended."""
+"""Logs: write MCAP files, read cut or damaged ones, recover and extend them."""

@@ -1,9 +1,9 @@
-"""Names and locks of a run's files, and how they are brought to the disk.
+"""Names and locks of a run's files, and their sync to the disk.
 
 A run is `run.mcap`, `run_1.mcap`, `run_2.mcap`, ...; the next run in the same directory is
 `run-1.mcap`, `run-1_1.mcap`, .... The recovered copy of a damaged file is `run.recovered.mcap`. A
 recorder locks its file while it writes, and the kernel releases the lock when the recorder dies. An
-unfinished file without a lock is to be recovered.
+unfinished file without a lock can be recovered.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def create(directory: Path, stem: str, number: int) -> tuple[Path, BinaryIO]:
     path = directory / (f"{stem}_{number}{SUFFIX}" if number else f"{stem}{SUFFIX}")
     file = path.open("xb")
     with contextlib.suppress(OSError):  # a file system without locks
-        fcntl.flock(file, fcntl.LOCK_EX)  # waits for nobody but who just looks whether it is free
+        fcntl.flock(file, fcntl.LOCK_EX)  # waits only for a process that checks the lock
     return path, file
 
 
@@ -46,7 +46,7 @@ def recovered_name(path: Path) -> Path:
 
 
 def in_use(path: Path) -> bool:
-    """Return True if a recorder that lives is writing a file; False if it cannot be opened."""
+    """Return True if a live recorder is writing a file; False if it cannot be opened."""
     try:
         with locked(path) as acquired:
             return not acquired
@@ -56,7 +56,7 @@ def in_use(path: Path) -> bool:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[bool]:
-    """Hold the lock of a file; False if somebody else has it.
+    """Hold the lock of a file; yield False if another process has it.
 
     Raises OSError if it cannot be opened.
     """
@@ -72,7 +72,7 @@ def locked(path: Path) -> Iterator[bool]:
 
 
 class FsyncThread:
-    """Syncs files to the disk in a thread, which the first request starts.
+    """Thread that syncs files to the disk; the first request starts it.
 
     A disk under load answers an fsync late: 0.1 s was measured on a machine with four busy
     processes, and memory cards take seconds. In the recorder's loop that wait would make the
@@ -91,8 +91,8 @@ class FsyncThread:
     def request(self, descriptor: int, *, last: bool = False) -> None:
         """Request the sync of a file, which may be closed after this, and return at once.
 
-        A request is skipped while one waits, which covers both, unless it is the `last` of this
-        file. Raises OSError if an earlier sync failed: written data may not be on the disk.
+        A request is skipped while another one waits, which covers both, unless it is the `last` of
+        this file. Raises OSError if an earlier sync failed: written data may not be on the disk.
         """
         with self._wake:
             self._raise()

@@ -1,7 +1,7 @@
-"""Where a run comes from: packages and machine; `shared.revision` has the code. Written first.
+"""Origin of a run: packages and machine; `shared.revision` has the commit. Written first.
 
-Two runs can only be expected to agree bit by bit if these do: OpenBLAS picks its
-kernels by CPU and thread count (docs/logs.md).
+Two runs can be expected to agree bit by bit only if these agree: OpenBLAS picks its kernels by CPU
+and thread count (docs/logs.md).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Reads an MCAP file that is finished, cut off anywhere, or damaged.
+"""Read an MCAP file that is finished, cut off anywhere, or damaged.
 
-Every whole record is given, in the order of the file; messages outside of chunks that follow each
-other are one, as those of a chunk are. Records of kinds that the format does not define yet, and
-private ones, are passed over. Where the file ends inside a chunk, the messages that can be read of
-its start are given. After damage, reading continues at the next chunk that proves to be one.
+The reader yields every whole record in the order of the file. Consecutive messages outside of
+chunks come as one record, like those of a chunk. Private records, and kinds that the format does
+not define yet, are skipped. If the file ends inside a chunk, the readable messages at its start are
+yielded. After damage, reading continues at the next valid chunk.
 """
 
 from __future__ import annotations
@@ -51,19 +51,20 @@ _CHUNK_MARKS: Final = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
 _MARK_AT: Final = PREFIX.size + CHUNK_TIMES.size
 """Offset of a chunk's compression from its start."""
 IN_LINE_NS: Final = 10 * NS_PER_S
-"""A recorder flushes four times a second: a chunk with longer times, or so far off, is opened."""
+"""Maximum length of a chunk, and distance from the one before, whose times are trusted. A recorder
+flushes four times a second."""
 _INDEX_HEAD: Final = struct.Struct("<HI")  # of a message index: channel, size of its entries
 _ENTRY: Final = struct.Struct("<QQ")  # of a message index: log time, offset in the chunk
 _DEFINITIONS: Final = (Opcode.SCHEMA, Opcode.CHANNEL)
 LOOSE_MAX: Final = 1 << 20
-"""Messages outside of chunks are given, and copied, in pieces of this size, bytes."""
+"""Size of the pieces in which messages outside of chunks are yielded and copied, bytes."""
 
 EXPANDED_MIN: Final = 1 << 28
-"""Bytes that any file may expand to."""
+"""Bytes to which any file may expand."""
 
 
 class LostBytes(msgspec.Struct, frozen=True):
-    """Bytes that hold nothing readable, and when they were written if they still say it."""
+    """Bytes that cannot be read, and their log times if these are known."""
 
     start: int
     end: int
@@ -71,11 +72,11 @@ class LostBytes(msgspec.Struct, frozen=True):
     last_ns: int = 0
     """Log times; 0: unknown."""
     missing: int | None = None
-    """Messages that these bytes lack: a chunk that can be read in part. None: nothing is read."""
+    """Messages lost from a chunk that can be read in part; None: nothing can be read."""
 
 
 class LogRecord(NamedTuple):
-    """One record that could be read, or messages outside of chunks that follow each other."""
+    """One readable record, or consecutive messages outside of chunks."""
 
     opcode: int
     start: int
@@ -90,7 +91,7 @@ class LogRecord(NamedTuple):
     definitions: Sequence[LogRecord] = ()
     """Schemas and channels inside the chunk."""
     lost: LostBytes | None = None
-    """What is missing of a chunk that can be read in part."""
+    """Missing part of a chunk that can be read in part."""
 
     def values(self) -> Iterator[McapRecord]:
         """Yield the decoded record and those inside the chunk."""
@@ -100,7 +101,7 @@ class LogRecord(NamedTuple):
 
 
 class ChunkPlace(NamedTuple):
-    """A chunk that was found and not opened, or messages outside of chunks."""
+    """A chunk that was found but not opened, or messages outside of chunks."""
 
     start: int
     """Offset of its record in the file."""
@@ -112,7 +113,7 @@ class ChunkPlace(NamedTuple):
 
 
 class LogReader:
-    """Reads one file. Iterate over it once; then `cut` and `damage` say what was lost.
+    """Reader of one file. Iterate over it once; then `cut` and `damage` hold what was lost.
 
     Or `skim` it, and `read_at` the places that are needed.
     """
@@ -123,7 +124,7 @@ class LogReader:
         self.finished = False
         """The recorder wrote the end of the file."""
         self.cut: LostBytes | None = None
-        """What follows the last whole record of an unfinished file."""
+        """Bytes behind the last whole record of an unfinished file."""
         self.damage: list[LostBytes] = []
         """Places in the middle that could not be read."""
         self.passed_over = 0
@@ -133,10 +134,10 @@ class LogReader:
         self.in_summary: Counter[int] = Counter()
         """Records of the summary, by opcode."""
         self.message_count: int | None = None
-        """Messages that the summary's statistics count; None if it has none or is damaged."""
+        """Messages that the summary's statistics count; None if these are missing or damaged."""
         self._encodings: dict[int, str] = {}
         self._vouched = 0
-        """Up to here, records of unknown kinds are known to lead to a known one."""
+        """Offset up to which records of unknown kinds are known to lead to a known one."""
         self._marks = list(_CHUNK_MARKS)
         self._expanded = 0
         self._end = self.size
@@ -147,7 +148,7 @@ class LogReader:
         """Yield every record up to the end of the data, the summary's channels first.
 
         The channels and schemas at the end of a finished file are copies of those in its first
-        chunk. They replace them if that chunk is damaged.
+        chunk, and replace them if that chunk is damaged.
         """
         yield from self._summary()
         at = len(MAGIC)
@@ -161,11 +162,11 @@ class LogReader:
                 yield record
 
     def skim(self) -> Iterator[LogRecord | ChunkPlace]:
-        """Yield what iteration does, but the places of messages in place of the messages.
+        """Yield what iteration does, but places instead of messages.
 
-        Only the heads of chunks are touched: damage within one shows when it is read. No CRC
-        covers the times in a head, so a chunk with times out of line is opened for those of its
-        messages; so is one whose channels nothing before it has described.
+        Only the heads of chunks are read: damage within a chunk shows when it is read. No CRC
+        covers the times in a head. So a chunk with times out of line is opened for those of its
+        messages, and so is a chunk with channels that no record before it described.
         """
         yield from self._summary()
         described = bool(self._encodings)
@@ -200,7 +201,7 @@ class LogReader:
                 yield record
 
     def read_at(self, start: int) -> LogRecord | None:
-        """Return the record at a place that `skim` found; None if it turns out damaged.
+        """Return the record at a place that `skim` found; None if it is damaged.
 
         Raises RunError if what was read so far is far larger than any run of that size.
         """
@@ -209,8 +210,8 @@ class LogReader:
         self._expanded += len(record.body) if record is not None else 0
         if self._expanded > max(EXPANDED_MIN, EXPANSION_MAX * self.size):
             raise RunError(
-                f"its {self.size >> 10} KiB expand to over {self._expanded >> 20} MiB: that is no "
-                "record of this project"
+                f"its {self.size >> 10} KiB expand to over {self._expanded >> 20} MiB: this is "
+                "not a log of this project"
             )
         self.damage = damage + [loss for loss in self.damage if loss not in damage]
         if record is not None:
@@ -247,11 +248,11 @@ class LogReader:
             at = end
 
     def raw(self, start: int, end: int) -> bytes:
-        """Return the file's bytes from one place to another."""
+        """Return the file's bytes from one offset to another."""
         return self._data[start:end]
 
     def _next(self, at: int) -> tuple[LogRecord | None, int]:
-        """Return the record at a place, if it can be read, and where to go on."""
+        """Return the record at an offset, if it can be read, and the offset to continue at."""
         if self._end - at < PREFIX.size:
             return None, self._lost(at, self._end)
         opcode, start, end = self._extent(at)
@@ -295,7 +296,7 @@ class LogReader:
         return record
 
     def _opened(self, at: int, end: int, chunk: Chunk) -> LogRecord:
-        """Return a chunk's records. A CRC vouches for its bytes, and its indices for its records.
+        """Return a chunk's records. A CRC proves its bytes, and the indices prove its records.
 
         Records that a writer did not complete are left out.
         """
@@ -317,9 +318,9 @@ class LogReader:
         return LogRecord(Opcode.CHUNK, at, end, content, chunk, rows, definitions, lost)
 
     def _behind_data_end(self, at: int) -> int:
-        """Return where to go on behind a data end: where the data ends, unless more follows.
+        """Return where to continue after a data end: where the data ends, unless more follows.
 
-        A writer that was finished and then took further messages has written its first summary,
+        A writer that finished and then accepted further messages has written its first summary,
         footer and magic in the middle of the file, or less if finishing failed.
         """
         if at >= self._end:
@@ -342,7 +343,7 @@ class LogReader:
     def _leads_on(self, at: int) -> bool:
         """Return True if a known record follows here, maybe behind unknown ones, or the data ends.
 
-        What is only passed over has no other proof of its length.
+        A record that is only skipped has no other proof of its length.
         """
         at = max(at, self._vouched)
         while self._end - at >= PREFIX.size:
@@ -397,7 +398,7 @@ class LogReader:
                 self._encodings[value.id] = value.message_encoding
 
     def _lost(self, start: int, following: int | None, first_ns: int = 0, last_ns: int = 0) -> int:
-        """Note that bytes are lost, up to the next readable ones; return where those are."""
+        """Record that bytes are lost, up to the next readable ones; return where those are."""
         end = self._end if following is None else following
         loss = LostBytes(start, end, first_ns, last_ns)
         if end < self._end or self.finished:
@@ -425,7 +426,7 @@ class LogReader:
         return opcode, start, start + length
 
     def _chunk_after(self, at: int) -> int | None:
-        """Return where the next chunk is that is whole and right, or None."""
+        """Return the offset of the next whole and valid chunk, or None."""
         while True:
             marks = {mark: self._data.find(mark, at + _MARK_AT, self._end) for mark in self._marks}
             self._marks = [mark for mark, place in marks.items() if place >= 0]
@@ -500,7 +501,7 @@ def _places(content: bytes, indices: Sequence[bytes]) -> list[int]:
 
 
 def _is_in_line(place: ChunkPlace, before_ns: int | None) -> bool:
-    """Return True for a chunk whose times are believed: it follows the one before it closely."""
+    """Return True if a chunk's times are plausible: it closely follows the one before it."""
     began_ns = place.first_ns if before_ns is None else before_ns
     return (
         place.last_ns > 0  # else it has no messages
@@ -520,23 +521,24 @@ def _times(body: bytes, opcode: int) -> tuple[int, int]:
 def open_log(path: Path) -> Iterator[LogReader]:
     """Open a file to read what can be read of it.
 
-    Raises RunError for a missing or empty file, a directory or a pipe, and one that is no MCAP
-    file.
+    Raises RunError for a missing or empty file, a directory, a pipe, and a file that is not MCAP.
     """
     with contextlib.ExitStack() as stack:
         try:
             mode = path.stat().st_mode
             if stat.S_ISDIR(mode):
-                raise RunError(f"{path}: cannot be read: a directory; give an MCAP file in it")
-            if not stat.S_ISREG(mode):  # a pipe would be waited on for ever
-                raise RunError(f"{path}: cannot be read: no ordinary file; give an MCAP file")
+                raise RunError(
+                    f"{path}: cannot be read: it is a directory; give an MCAP file in it"
+                )
+            if not stat.S_ISREG(mode):  # reading a pipe would block forever
+                raise RunError(f"{path}: cannot be read: not a regular file; give an MCAP file")
             file = stack.enter_context(path.open("rb"))
             if not os.fstat(file.fileno()).st_size:
-                raise RunError(f"{path}: is empty; an MCAP file is right")
+                raise RunError(f"{path}: is empty; give an MCAP file")
             data = stack.enter_context(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
         except OSError as error:
             found = f"cannot be read: {error.strerror}"
             raise RunError(f"{path}: {found}; give an MCAP file") from None
         if data[: len(MAGIC)] != MAGIC:
-            raise RunError(f"{path}: is no MCAP file (wrong first bytes)")
+            raise RunError(f"{path}: is not an MCAP file (wrong first bytes)")
         yield LogReader(data)

@@ -1,9 +1,9 @@
-"""MCAP records as bytes: encoded, and decoded without trusting one of them. Pure.
+"""Encode MCAP records, and decode them without trusting any of them. Pure.
 
-The records are the classes of the mcap package; its own readers trust each length: a wrong one
-makes them read on, allocate or raise (docs/logs.md). Here a record counts only if its fields fit
-into its length; everything else is `Malformed`. Bytes behind the last field are a later version's,
-which the format lets a reader skip.
+The records are the classes of the mcap package. Its own readers trust each length: a wrong one
+makes them read on, allocate or raise (docs/logs.md). Here a record is valid only if its fields fit
+into its length; everything else is `Malformed`. Bytes behind the last field belong to a later
+version, and the format lets a reader skip them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["Attachment", "Channel", "Chunk", "Header", "McapRecord", "Metadata",
 MAGIC: Final = b"\x89MCAP0\r\n"
 
 PREFIX: Final = struct.Struct("<BQ")
-"""Every record: opcode, length of what follows."""
+"""Start of every record: opcode, length of the rest."""
 MESSAGE_RECORD: Final = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence, log time, publish time; then the payload."""
 CHUNK_TIMES: Final = struct.Struct("<QQQI")
@@ -52,9 +52,9 @@ ZSTD_LEVEL: Final = 1
 """JSON rows with measured doubles are smaller at level 1 than at any level up to 12. At the default
 level 3 a run is 6 % larger and takes twice the time (findings/zstd_level_of_json_rows.sh)."""
 DECOMPRESSED_MAX: Final = 1 << 26
-"""A larger chunk is read only if its bytes can hold so much: a flipped bit asks for exabytes."""
+"""Maximum size of a chunk, unless its bytes can hold more: a flipped bit claims exabytes."""
 EXPANSION_MAX: Final = 50
-"""A run's chunks are four to ten times as large as they are compressed."""
+"""Maximum expansion of compressed bytes; a run's chunks expand four to ten times."""
 _WINDOW_MAX: Final = 1 << 27
 _STEP: Final = 1 << 16
 
@@ -69,7 +69,7 @@ _TYPES: Final[Mapping[int, type[McapRecord]]] = MappingProxyType(
     }
 )
 KNOWN: Final = frozenset({*_TYPES, Opcode.MESSAGE_INDEX, Opcode.CHUNK, Opcode.MESSAGE})
-"""Records of a file's data section."""
+"""Opcodes of a file's data section."""
 
 
 class Malformed(Exception):  # noqa: N818 - a finding about a file, never shown as an error
@@ -77,7 +77,7 @@ class Malformed(Exception):  # noqa: N818 - a finding about a file, never shown 
 
 
 class _Fields(ReadDataStream):
-    """Reads a record's fields, never beyond its end."""
+    """Fields of a record, never read beyond its end."""
 
     def __init__(self, body: bytes) -> None:
         super().__init__(BytesIO(body))
@@ -103,7 +103,7 @@ def with_prefix(opcode: int, body: bytes) -> bytes:
 
 
 def compressed_chunk(first_ns: int, last_ns: int, content: bytes) -> Chunk:
-    """Return a zstd chunk of these records; its messages have the first and the last log time."""
+    """Return a zstd chunk of these records, with its messages' first and last log time."""
     return Chunk(
         compression="zstd",
         data=zstandard.compress(content, ZSTD_LEVEL),
@@ -115,7 +115,7 @@ def compressed_chunk(first_ns: int, last_ns: int, content: bytes) -> Chunk:
 
 
 def message_index(channel_id: int, rows: Iterable[tuple[int, int]]) -> bytes:
-    """Return the record that says where a channel's messages are in their chunk.
+    """Return the index record of a channel's messages in their chunk.
 
     `rows` have log time and offset in the decompressed chunk of each message.
     """
@@ -124,9 +124,9 @@ def message_index(channel_id: int, rows: Iterable[tuple[int, int]]) -> bytes:
 
 
 def file_end(position: int, groups: Mapping[int, bytes]) -> bytes:
-    """Return what follows the last message of a finished file: data end, summary, footer, magic.
+    """Return the bytes after the last message of a finished file: data end, summary, footer, magic.
 
-    It begins at the offset `position`; `groups` are the records of the summary by opcode, joined.
+    They begin at the offset `position`; `groups` are the records of the summary by opcode, joined.
     """
     data_end = encode(DataEnd(data_section_crc=0))
     summary_start = position + len(data_end)
@@ -173,7 +173,7 @@ def decode(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
         if CRC.unpack_from(body, crc_at)[0] not in (0, zlib.crc32(body[:crc_at])):
             raise Malformed
     elif not isinstance(found, Header) and not body.startswith(encode(found)[PREFIX.size :]):
-        raise Malformed  # a map's length that its pairs do not have
+        raise Malformed  # a map's length does not fit its pairs
     return found, fields.count
 
 
@@ -207,8 +207,7 @@ def decode_chunk(body: bytes, *, cut: bool = False) -> tuple[Chunk, int]:
 def decompressed(chunk: Chunk) -> bytes:
     """Return a chunk's records.
 
-    Raises Malformed if size or CRC are not as the head gives them, or nothing here reads the
-    compression.
+    Raises Malformed if size or CRC differ from those in the head, or the compression is unknown.
     """
     if chunk.uncompressed_size > max(DECOMPRESSED_MAX, EXPANSION_MAX * len(chunk.data)):
         raise Malformed
@@ -227,10 +226,10 @@ def decompressed(chunk: Chunk) -> bytes:
 
 
 def decompressed_start(chunk: Chunk) -> bytes:
-    """Return what can be read of a chunk whose end is missing; no CRC vouches for it.
+    """Return the readable start of a chunk whose end is missing; no CRC covers it.
 
-    zstd decompresses by blocks of up to 128 KiB: what follows the last whole block is lost. Of lz4,
-    which this project does not write, nothing is read.
+    zstd decompresses by blocks of up to 128 KiB; data behind the last whole block is lost. lz4,
+    which this project does not write, is not read at all.
     """
     size = chunk.uncompressed_size
     if size > DECOMPRESSED_MAX or chunk.compression not in ("", "zstd"):
@@ -282,10 +281,10 @@ class ChunkMessage(NamedTuple):
 def split_messages(
     data: bytes | mmap.mmap, at: int, end: int, *, enough: float = math.inf, origin: int = 0
 ) -> tuple[list[ChunkMessage], int]:
-    """Return the messages that follow each other from `at` on, and where they end.
+    """Return consecutive messages from `at` on, and where they end.
 
-    Their places are counted from `origin`. A message that does not fit before `end`, or is too
-    short, is left out with all behind it; at `enough` bytes no further message is taken.
+    Their offsets count from `origin`. A message that does not fit before `end`, or is too short, is
+    left out with all behind it; at `enough` bytes no further message is taken.
     """
     rows: list[ChunkMessage] = []
     begin, new, message, head = at, ChunkMessage._make, int(Opcode.MESSAGE), MESSAGE_RECORD
@@ -300,21 +299,21 @@ def split_messages(
 
 
 class _ChunkContent(NamedTuple):
-    """The records of a chunk that can be read."""
+    """Readable records of a chunk."""
 
     rows: list[ChunkMessage]
     others: list[tuple[int, bytes]]
-    """Opcode and body of each record that is no message."""
+    """Opcode and body of each record that is not a message."""
     whole: bool
-    """The records fill the chunk. Its CRC does not prove that: a writer that fails in the middle
-    of a record, and goes on, computes the CRC over what it has written."""
+    """True if the records fill the chunk. Its CRC does not prove that: a writer that fails in the
+    middle of a record, and continues, computes the CRC over what it has written."""
 
 
 def split_chunk(data: bytes, places: Sequence[int] = ()) -> _ChunkContent:
     """Split a chunk's decompressed data into its records.
 
-    `places` are the offsets of its messages, in order, if they are known: behind an incomplete
-    record, reading continues at the next of them.
+    `places` are the offsets of its messages, in order, if known. Behind an incomplete record,
+    reading continues at the next of them.
     """
     others: list[tuple[int, bytes]] = []
     whole = True

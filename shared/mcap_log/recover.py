@@ -1,10 +1,10 @@
-"""Recovers a file that was never finished: a copy with the index that every reader needs.
+"""Recover an unfinished file: write a copy with the index that every reader needs.
 
-The original stays until the copy is complete and on the disk; a
-recovery that is killed leaves the original as it was, and the next one starts over.
+The original stays until the copy is complete and on the disk. A recovery that is killed leaves the
+original unchanged, and the next one starts over.
 
-Chunks are copied as they are, byte for byte, and get the index that they lack. The mcap package's
-writer cannot copy a chunk that exists already, and adding each message again cost 36 us a message.
+Chunks are copied byte for byte, and get the index that they lack. The mcap package's writer cannot
+copy an existing chunk, and adding each message again took 36 us a message.
 """
 
 from __future__ import annotations
@@ -58,10 +58,10 @@ _INDICES: Final = MappingProxyType(
         Opcode.METADATA: Opcode.METADATA_INDEX,
     }
 )
-"""Records that a summary says the place of."""
+"""Records whose places a summary holds."""
 
 
-class Interrupted(Exception):  # noqa: N818 - not an error: the recorder is to stop
+class Interrupted(Exception):  # noqa: N818 - not an error: the recorder must stop
     """The recovery was interrupted; the original is unchanged."""
 
 
@@ -81,7 +81,7 @@ class _RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
     passed_over: int
     """Records of kinds that the format does not define; left out."""
     counted: int | None
-    """Messages that the original's summary counts; None if it has none or is damaged."""
+    """Messages that the original's summary counts; None if that is missing or damaged."""
     earlier_ends: int
     """Ends in the middle of the original; left out."""
     cut: LostBytes | None
@@ -130,8 +130,8 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> _RecoveryResul
                 copy.finish(_note(path, copy, reader))
         except OSError as error:
             raise RunError(
-                f"{out}: cannot be written: {error.strerror or error}; {path} is as it was; "
-                "free space there, or recover elsewhere with -o"
+                f"{out}: cannot be written: {error.strerror or error}; {path} is unchanged; "
+                "free some space, or choose another output with -o"
             ) from None
     return _RecoveryResult(
         out=out,
@@ -171,7 +171,7 @@ def describe(outcome: _RecoveryResult) -> list[str]:
 
 def describe_passed_over(count: int) -> str:
     """Return words for records of unknown kinds."""
-    return f"{count} private record{'s' * (count != 1)}, or of a later version of MCAP"
+    return f"{count} record{'s' * (count != 1)}, private or from a later version of MCAP"
 
 
 def describe_earlier_ends(count: int) -> str:
@@ -214,7 +214,7 @@ def _describe_damage(loss: LostBytes) -> str:
 
 
 def clock_time(time_ns: int) -> str:
-    """Return a log time as local time of day, or as seconds if it is no date."""
+    """Return a log time as local time of day, or as seconds if it is not a date."""
     if time_ns < 10**17:  # lockstep: virtual time from 0
         return f"{time_ns / NS_PER_S:.3f} s"
     try:
@@ -239,9 +239,9 @@ def _when(loss: LostBytes) -> str:
 
 
 class _LogCopy:
-    """Takes the records of a file in their order and writes what a finished file needs.
+    """Finished copy of a file, written from its records in order.
 
-    `raw` gives the original's bytes from one offset to another.
+    `raw` returns the original's bytes from one offset to another.
     """
 
     def __init__(self, file: BinaryIO, raw: Callable[[int, int], bytes]) -> None:
@@ -258,7 +258,7 @@ class _LogCopy:
         self._definitions: dict[tuple[int, int], bytes] = {}
         """By opcode and id: a schema's or a channel's record."""
         self._written: set[tuple[int, int]] = set()
-        """Those that are in the copy already."""
+        """Definitions that are in the copy already."""
         self._without_schema: set[int] = set()
         """Channels whose schema is lost."""
         self._loose: list[bytes] = []
@@ -286,7 +286,7 @@ class _LogCopy:
                 self._take_loose(record)
 
     def finish(self, note: Metadata) -> None:
-        """Write the end: a note of what this copy is, and the index."""
+        """Write the end: a note about this copy, and the index."""
         self._write_loose()
         self._write_definitions()
         self._write_metadata(note)
@@ -300,7 +300,7 @@ class _LogCopy:
         self._write(file_end(self._position, groups))
 
     def _define(self, record: LogRecord, *, vouched: bool = False) -> None:
-        """Learn a schema or a channel; one that a chunk's CRC vouches for replaces another."""
+        """Store a schema or a channel; one that a chunk's CRC covers replaces another."""
         found, raw = record.value, with_prefix(record.opcode, record.body)
         if isinstance(found, Schema):
             if vouched or (Opcode.SCHEMA, found.id) not in self._definitions:
@@ -422,7 +422,7 @@ class _LogCopy:
             self._position += self._file.write(head)
 
     def _write(self, data: bytes) -> tuple[int, int]:
-        """Write behind the header; return offset and length."""
+        """Write after the header; return offset and length."""
         self._begin("")
         start = self._position
         self._file.write(data)

@@ -39,7 +39,7 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.OperatorIntent, "park"): messages.Park,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
-"""Fields that are plain integers on the bus and enumerations in the mind."""
+"""Fields that are plain integers on the bus and stand for an enumeration."""
 
 _PLAIN: Final[dict[type[inspect.Type], str]] = {
     inspect.BoolType: "boolean",
@@ -55,15 +55,15 @@ def name_of(message_type: type[Message]) -> str:
 
 
 def json_schema(message_type: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the flat JSON schema of a message type; RunError for a field without a place in it."""
+    """Return the flat JSON schema of a message type; RunError for a field that does not fit it."""
     info = inspect.type_info(message_type)
     if not isinstance(info, inspect.StructType):
-        raise RunError(f"{message_type}: no msgspec struct; recorded messages are structs")
+        raise RunError(f"{message_type}: not a msgspec struct; recorded messages must be structs")
     return _object(info, message_type.__name__)
 
 
 def encoded(message_type: type[Message]) -> bytes:
-    """Return the schema as it goes into the file."""
+    """Return the schema as bytes for the file."""
     return msgspec.json.encode(json_schema(message_type))
 
 
@@ -108,14 +108,14 @@ def _node(info: inspect.Type, where: str) -> dict[str, Any]:
     if isinstance(info, inspect.ListType | inspect.VarTupleType):
         return _array(_node(info.item_type, f"{where}[]"), where)
     raise RunError(
-        f"{where}: {type(info).__name__} has no place in a flat JSON schema; use numbers, "
+        f"{where}: {type(info).__name__} does not fit into a flat JSON schema; use numbers, "
         "strings, booleans, structs, integer enumerations, or arrays of one of them"
     )
 
 
 def _array(items: dict[str, Any], where: str) -> dict[str, Any]:
     if items["type"] == "array":
-        raise RunError(f"{where}: an array in an array, which Foxglove refuses; flatten it")
+        raise RunError(f"{where}: Foxglove rejects an array in an array; flatten it")
     return {"type": "array", "items": items}
 
 

@@ -1,4 +1,4 @@
-"""Counts lost messages by the sequence numbers of one key. Pure."""
+"""Count lost messages by the sequence numbers of one key. Pure."""
 
 from __future__ import annotations
 
@@ -6,23 +6,23 @@ import msgspec
 
 
 class KeyCount(msgspec.Struct, gc=False, kw_only=True):
-    """What came on one key so far; feed it every sequence number in order of arrival."""
+    """Counts of one key; feed it every sequence number in order of arrival."""
 
     count: int = 0
-    """Messages that came."""
+    """Received messages."""
     gaps: int = 0
     """Times the sequence jumped forward."""
     missing: int = 0
-    """Messages jumped over, all gaps together."""
+    """Messages missing in all gaps together."""
     restarts: int = 0
     """Times the sequence did not go up: a new sender counts from 0 again."""
     last_seq: int = -1
     """Newest sequence number; -1 before the first."""
     several: bool = False
-    """Several senders number their messages on this key: their numbers tell nothing of losses."""
+    """True if several senders number their messages on this key; losses are then unknown."""
 
     def feed(self, seq: int) -> None:
-        """Take the sequence number of the next message.
+        """Count the sequence number of the next message.
 
         Messages before the first one received are not counted as lost: a subscriber connects after
         the sender's start, or after its own.

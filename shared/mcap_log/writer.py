@@ -1,4 +1,4 @@
-"""Writes a run's MCAP files.
+"""Write a run's MCAP files.
 
 A run is `run.mcap`, and `run_1.mcap`, `run_2.mcap`, ... if it is split; each can be read alone.
 Layout of each: metadata `run`, `clock`, `packages` and `split`, the attachments, all schemas and
@@ -6,14 +6,14 @@ channels, then zstd chunks with the messages as they came (JSON), at the end met
 this file) and the summary. The first chunk holds schemas and channels again, as the mcap package
 writes them: damage to one leaves the other.
 
-Time: `log_time` is when the recorder took a message off its queue (at most one drain
-period after it came), `publish_time` the message's own `t_ns`. Both are monotonic
-clocks; one offset, taken at the start and written as `offset_ns` into metadata `clock`,
-maps them to ns since 1970 so that viewers show dates: wall = monotonic + offset_ns.
-`publish_time` therefore means something only for senders on the recorder's host.
+Time: `log_time` is when the recorder took a message off its queue (at most one drain period after
+it came), `publish_time` the message's own `t_ns`. Both are monotonic clocks. One offset, taken at
+the start and written as `offset_ns` into metadata `clock`, maps them to ns since 1970 so that
+viewers show dates: wall = monotonic + offset_ns. So `publish_time` is meaningful only for senders
+on the recorder's host.
 
-A file whose writer was killed has no summary: `shared/mcap_log/recover.py` gives it
-one, and `tools/logs/run_log.py` reads it as it is. While it is written it is locked.
+A file whose writer was killed has no summary: `shared/mcap_log/recover.py` adds one, and
+`tools/logs/run_log.py` reads it as it is. A file is locked while it is written.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ _UNSIGNED = msgspec.Meta(ge=0, le=2**62)  # so that MCAP's unsigned 64-bit times
 
 
 class MessageSource(Protocol):
-    """Where messages come from: a stream of the bus."""
+    """Source of messages: a stream of the bus."""
 
     def take(self) -> tuple[str, bytes, int] | None:
-        """Return (key, payload, monotonic ns of this call), or None if there is none now."""
+        """Return (key, payload, monotonic ns of this call), or None if none is waiting."""
 
 
 class FilePlace(Enum):
-    """Where the file is that is being written."""
+    """Location of the file that is being written."""
 
     THERE = "at its path"
     MOVED = "moved away"
@@ -82,7 +82,7 @@ class FilePlace(Enum):
 
 
 class _MessageHead(msgspec.Struct, gc=False):
-    """The two fields of a message that the recorder needs; the rest is skipped over."""
+    """The two fields of a message that the recorder needs; the rest is skipped."""
 
     t_ns: Annotated[int, _UNSIGNED]
     seq: Annotated[int, _UNSIGNED]
@@ -91,8 +91,7 @@ class _MessageHead(msgspec.Struct, gc=False):
 class RunWriter:
     """One run being written; leaving the `with` block finishes its file.
 
-    If the block is left by an exception the file is closed as it is: a readable file without a
-    summary.
+    If an exception leaves the block, the file is closed as it is: readable, but without a summary.
     """
 
     def __init__(
@@ -108,10 +107,10 @@ class RunWriter:
     ) -> None:
         """Create `run.mcap` in `directory`, or `run-1.mcap`, ... if there is a run already.
 
-        `topics` are those of every key to record, `offset_ns` is wall minus monotonic clock. If the
-        wall clock is behind, it is not set, and the times of the file are those of the monotonic
-        clock: MCAP has no time before 1970. `metadata` records, by name, and `attachments`, by file
-        name, go into each file; `chunk_kib` is the size of a chunk before compression. Without
+        `topics` are those of every key to record, `offset_ns` is wall minus monotonic clock. A
+        negative offset means that the wall clock is not set. The file's times are then monotonic,
+        because MCAP has no time before 1970. `metadata` records, by name, and `attachments`, by
+        file name, go into each file; `chunk_kib` is the size of a chunk before compression. Without
         `begin` the first file is left to `begin`. Raises RunError if the file cannot be created or
         written, as all methods do.
         """
@@ -124,7 +123,7 @@ class RunWriter:
         }
         """Counts of the whole run."""
         self.unknown: dict[str, int] = {}
-        """Messages on keys that have no row in the table of topics; not written."""
+        """Messages on keys outside the table of topics; not written."""
         self.malformed: dict[str, int] = {}
         """Messages without a readable `t_ns` and `seq`; not written."""
         self.left_out = 0
@@ -180,7 +179,7 @@ class RunWriter:
 
     @property
     def where_is_file(self) -> FilePlace:
-        """Look whether the open file is still at its path."""
+        """Location of the open file, compared with its path."""
         if self._file is None:
             return FilePlace.THERE
         own = os.fstat(self._file.fileno())
@@ -188,7 +187,7 @@ class RunWriter:
             there = os.path.samestat(own, self.path.stat())
         except (FileNotFoundError, NotADirectoryError):
             there = False
-        except OSError:  # nobody can tell
+        except OSError:  # unknown
             there = True
         if there:
             return FilePlace.THERE
@@ -253,14 +252,14 @@ class RunWriter:
                 self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
 
     def sync(self) -> None:
-        """Flush, and have it brought to the disk meanwhile: it then survives a loss of power."""
+        """Flush, and sync to the disk in the background: the data then survives a loss of power."""
         if self._file is not None:
             with self._as_run_error("cannot be written"):
                 self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
                 self._syncer.request(self._file.fileno())
 
     def finish(self) -> None:
-        """Finish the open file, if there is one; `begin` begins the next."""
+        """Finish the open file, if any; `begin` starts the next."""
         if self._file is None:
             return
         with self._as_run_error("cannot be finished"):
@@ -327,8 +326,8 @@ class RunWriter:
             yield
         except OSError as error:
             raise RunError(
-                f"{self.path}: {what}: {error.strerror or error}; what was flushed before "
-                "stays readable; free space there, or record elsewhere with --out"
+                f"{self.path}: {what}: {error.strerror or error}; the data flushed so far "
+                "stays readable; free some space, or record elsewhere with --out"
             ) from None
 
 

@@ -1,4 +1,4 @@
-"""Keeps which impairments are active, and until when; records each change as an event. Pure.
+"""Schedule of a network's impairments; each change is reported as an event. Pure.
 
 Lockstep and the network proxy use it.
 """
@@ -18,16 +18,16 @@ class _Pending(NamedTuple):
     """One impairment that is not over, started or not."""
 
     begins: float
-    """On the owner's clock; minus infinite: it started with the request."""
+    """Start on the owner's clock; minus infinite: with the request."""
     until: float
-    """On the owner's clock; infinite: it does not end by itself."""
+    """End on the owner's clock; infinite: no end."""
     link: str
     """A direction or a group of them."""
     what: Impairment
 
 
 class ImpairmentSchedule:
-    """All of them, by number. `report` takes an event for each direction as one begins or ends.
+    """All impairments by number; `report` receives an event per direction at each begin and end.
 
     Times are on the owner's clock; `now_ns` is the stamp of the events. A link is one of
     `shared.links`, else ConfigError.
@@ -38,11 +38,11 @@ class ImpairmentSchedule:
     ) -> None:
         self.requested: dict[int, _Pending] = {}
         self.next_due = math.inf
-        """When the first of them begins or ends, on the owner's clock."""
+        """Time of the next begin or end, on the owner's clock."""
         self._directions = directions
         self._report = report
         self._coming: list[int] = []
-        """Those that have not started, in the order of the requests."""
+        """Impairments that have not started, in the order of the requests."""
         self._count = self._reported = 0
 
     def begin(self, link: str, what: Impairment, until: float, now_ns: int) -> int:
@@ -62,7 +62,7 @@ class ImpairmentSchedule:
         return self._count
 
     def end(self, number: int, now_ns: int) -> None:
-        """End one, or keep it from beginning; nothing if it is over already."""
+        """End an impairment or cancel its start; no effect if it is over."""
         requested = self.requested.pop(number, None)
         if requested is None:
             return
@@ -75,7 +75,7 @@ class ImpairmentSchedule:
         self._find_next()
 
     def advance(self, clock: float, now_ns: int) -> bool:
-        """End and start what is due by the owner's clock; return True if anything was.
+        """End and start what is due on the owner's clock; return True if anything was due.
 
         An impairment that would be over before its start never starts.
         """
@@ -98,7 +98,7 @@ class ImpairmentSchedule:
         return len(found)
 
     def counts(self, number: int) -> tuple[int, int]:
-        """Return the messages that have passed, and that were lost, while it was in force."""
+        """Return the numbers of messages that passed and that were lost while it was active."""
         found = [direction.requested(number) for direction in self._directions.values()]
         counted = [impairer for impairer in found if impairer is not None]
         return sum(one.passed for one in counted), sum(one.lost for one in counted)

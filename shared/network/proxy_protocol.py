@@ -15,11 +15,11 @@ LINE_MAX: Final = 65536
 
 
 class Begin(msgspec.Struct, frozen=True, tag="begin"):
-    """Put an impairment in force, now or soon; `at` of it is not looked at."""
+    """Request: start an impairment, now or later; its `at` is ignored."""
 
     inject: Inject
     in_s: float = 0.0
-    """From now, s; the network proxy waits, not the one that asks."""
+    """Delay, s; the network proxy waits, not the client."""
 
 
 class Clear(msgspec.Struct, frozen=True, tag="clear"):
@@ -43,18 +43,18 @@ class RequestedImpairment(msgspec.Struct, frozen=True):
     detail: str
     """The impairment, as `--inject` takes it."""
     left_s: float | None
-    """Until it ends, s from now; None: it does not by itself."""
+    """Time until it ends, s; None: no end."""
     passed: int
-    """Messages (batches of Zenoh's) while it was in force."""
+    """Messages (Zenoh batches) that passed while it was active."""
     lost: int
-    """Messages among them that were lost."""
+    """Messages (Zenoh batches) that were lost while it was active."""
     in_s: float = 0.0
-    """Until it begins, s from now; 0: it has."""
+    """Time until it begins, s; 0: it has begun."""
     hidden: tuple[str, ...] = ()
-    """Its directions on which another one is in force (`shared.config.impairment.Direction`)."""
+    """Its directions on which another one is active (`shared.config.impairment.Direction`)."""
 
     def standing(self) -> str:
-        """Return what keeps it from being done now, and where; empty if nothing does."""
+        """Return why it is not active now, and where; empty if it is active."""
         if self.in_s:
             return f"in {self.in_s:.1f} s"
         if not self.hidden:
@@ -63,7 +63,7 @@ class RequestedImpairment(msgspec.Struct, frozen=True):
         return "hidden" if len(self.hidden) == count else f"hidden on {len(self.hidden)} of {count}"
 
     def describe(self) -> str:
-        """Return where it is, what, and what keeps it from being done now."""
+        """Return its link, its impairment, and why it is not active now."""
         standing = self.standing()
         return f"{self.link} {self.detail}{f' ({standing})' if standing else ''}"
 

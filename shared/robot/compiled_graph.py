@@ -1,9 +1,9 @@
 """A CasADi graph with fixed memory: a call in a loop costs microseconds and allocates nothing.
 
-CasADi interprets a graph. Where a C compiler is, `python -m tools.graph_libraries` translates the
-graphs of a robot into C once (`deploy/lib.sh` calls it), and every process loads what it finds.
-There is no second law: the C comes from the graph, and a library is kept only if it gives the same
-numbers to the last bit. Without libraries all runs, slower.
+CasADi interprets a graph. With a C compiler, `python -m tools.graph_libraries` translates the
+graphs of a robot into C once (`deploy/lib.sh` calls it), and every process loads the libraries that
+it finds. There is no second law: the C comes from the graph, and a library is kept only if it gives
+the same numbers to the last bit. Without libraries everything runs, slower.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from shared.arrays import Array
 FOLDER: Final = Path(sys.prefix) / "xrl-graphs"
 """Libraries of this environment, one for each graph."""
 FLAGS: Final = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
-"""The compiler's. No fused multiply-add: it would round otherwise than CasADi's interpreter. The
+"""Compiler flags. No fused multiply-add, which rounds differently from CasADi's interpreter. The
 functions of its library are an exception (`tools.graph_libraries.translation`)."""
 SWITCH: Final = "XRL_GRAPHS"
-"""Environment variable; `interpreted` leaves every library aside."""
+"""Environment variable; `interpreted` ignores every library."""
 
 
 class CompiledGraph:
@@ -50,7 +50,7 @@ class CompiledGraph:
             buffer.set_res(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
 
     def bind(self, index: int, array: Array) -> None:
-        """Read an argument from a caller's contiguous array (n,), which must live as long."""
+        """Read an argument from a caller's contiguous array (n,), which must outlive this graph."""
         assert array.shape == self.arguments[index].shape  # noqa: S101 - else it reads beyond
         self.arguments[index] = array
         self._buffer.set_arg(index, memoryview(array))  # type: ignore[call-arg, arg-type]  # casadi's stub
@@ -65,15 +65,15 @@ def library_of(function: ca.Function) -> Path:
     """Return the path of a graph's library, whether it was built or not.
 
     Its name is a hash of the graph with all its constants, of CasADi's version and the compiler's
-    flags: another robot or another law has another library. Finding it takes
-    milliseconds; of a graph that is kept it is looked up once.
+    flags, so another robot or law has another library. The look-up takes milliseconds and is
+    cached.
     """
     content = f"{ca.CasadiMeta.version()}\n{FLAGS}\n{function.serialize()}"
     return FOLDER / f"{function.name()}-{hashlib.sha256(content.encode()).hexdigest()[:32]}.so"
 
 
 def _translated(function: ca.Function) -> ca.Function | None:
-    """Return a graph's translation; None if there is none, or it cannot be loaded."""
+    """Return a graph's translation; None if it is missing or cannot be loaded."""
     path = library_of(function)
     if not path.is_file() or os.environ.get(SWITCH) == "interpreted":
         return None

@@ -1,4 +1,4 @@
-"""Where torso, modules and harness are, one in the other, and the body over the feet. Pure.
+"""Poses of torso, modules and harness in each other, and the body over the feet. Pure.
 
 Rotations are unit quaternions (x, y, z, w). The frames are `world`; `torso`; below it on each leg
 `hip_*` (carries the thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso
@@ -66,7 +66,7 @@ def _joint_pair(q: Sequence[float], module: str) -> tuple[float, float]:
 def torso_pose(
     geometry: GeometryConfig, q: Sequence[float], stance: Vector6
 ) -> tuple[Vector3, Quaternion]:
-    """Return the torso's pose in the world, m: the mean of what the two legs say.
+    """Return the torso's pose in the world, m: the mean of the two legs' estimates.
 
     The world is midway between the feet, at the height of the ankles; both feet lie on the floor.
     Joint angles are (12,), rad; `stance` is the place of the right foot, as in `PlannerStatus`.
@@ -89,7 +89,7 @@ def torso_pose(
 
 
 def _foot_place(geometry: GeometryConfig, side: str, stance: Vector6) -> tuple[Vector3, Quaternion]:
-    """Return where a foot stands, world axes; each takes half of the stance."""
+    """Return a foot's pose, world axes; each foot takes half of the stance."""
     half, y = -side_sign(side) / 2, side_sign(side) * geometry.w_base / 2
     dx, dy, dz, *turn = (half * part for part in stance)
     angle = math.hypot(*turn)
@@ -148,7 +148,7 @@ def product(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def inverse(rotation: Quaternion) -> Quaternion:
-    """Return the rotation back."""
+    """Return the inverse rotation."""
     x, y, z, w = rotation
     return -x, -y, -z, w
 
@@ -162,9 +162,9 @@ def rotated(rotation: Quaternion, vector: Vector3) -> Vector3:
 def capture_point(p: Sequence[float], pdot: Sequence[float], slope: Pair = (0.0, 0.0)) -> Pair:
     """Return where the body would come to rest as an inverted pendulum: x - slope z + x' sqrt(z/g).
 
-    x and y, m, from midway between the ankles. The pose p begins with COM x y z, m, z > 0, its rate
-    pdot is in m/s; the slope is the floor's rise along x and y, rad: uphill of the ankles the COM
-    is over them.
+    x and y, m, from midway between the ankles. The pose p begins with COM x y z, m, z > 0; its rate
+    pdot is in m/s. The slope is the floor's rise along x and y, rad: a COM uphill of the ankles is
+    over them.
     """
     swing = math.sqrt(p[2] / GRAVITY)
     return p[0] - slope[0] * p[2] + swing * pdot[0], p[1] - slope[1] * p[2] + swing * pdot[1]

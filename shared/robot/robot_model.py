@@ -1,13 +1,13 @@
-"""The one generated model of the robot, as MJCF, for Pinocchio and MuJoCo alike.
+"""Generated model of the robot, as MJCF, for both Pinocchio and MuJoCo.
 
-The torso is the free root; each leg hangs from it: hip, knee, ankle. The paper writes
-the joints from the foot up (docs/law.md#the-robot: R_torso = prod Rx(phi) Ry(theta)), so
-here, from the torso down, each module is theta first, about -y, then phi, about -x:
-the joint angles keep the paper's meaning and sign.
+The torso is the free root; each leg hangs from it: hip, knee, ankle. The paper writes the joints
+from the foot up (docs/law.md#the-robot: R_torso = prod Rx(phi) Ry(theta)). Here, from the torso
+down, each module is theta first, about -y, then phi, about -x, so the joint angles keep the paper's
+meaning and sign.
 
-Masses are the paper's: two hip modules, batteries and payload at the torso's centre;
-a knee module at each knee (half on the thigh, half on the shin: the same point); an
-ankle module in each foot, at the ankle.
+Masses are the paper's: two hip modules, batteries and payload at the torso's centre; a knee module
+at each knee (half on the thigh, half on the shin: the same point); an ankle module in each foot, at
+the ankle.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MODULE_RADIUS = 0.08
 """m; a module is a ball of this radius: gives the links a rotational inertia (assumed)."""
 
 HARD_STOP_MARGIN = 0.15
-"""rad beyond the soft limits at which the mechanism itself ends (assumed)."""
+"""rad; distance of the hard stops beyond the soft limits (assumed)."""
 
 _SIGN = {"right": -1.0, "left": 1.0}
 
@@ -119,7 +119,7 @@ def ball_inertia(mass: float) -> tuple[float, float, float]:
 
 
 def numbers(*values: float) -> str:
-    """Return numbers as the attribute of an XML element; read again, they are the same."""
+    """Return numbers as an XML attribute that parses back to the same values."""
     return " ".join(repr(float(value)) for value in values)
 
 

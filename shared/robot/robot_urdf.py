@@ -1,8 +1,8 @@
 """The robot as URDF, for ROS 2: the links, joints, masses and shapes of `shared.robot.robot_model`.
 
 `torso` is the root. A module has two joints, theta about -y and phi about -x. A link without mass
-(`cross_of`) stands between the part above it and the part below, which has the module's name.
-The joints have the names and signs of q (`shared.joints`).
+(`cross_of`) connects the part above it and the part below, which has the module's name. The joints
+have the names and signs of q (`shared.joints`).
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
-"""Geometry of the six-leg harness sensor: leg forces to a wrench and back (docs/law.md#harness).
+"""Geometry of the six-leg harness sensor: wrench from leg forces (docs/law.md#harness).
 
-The sensor is a Stewart platform of six load cells between the torso and the operator's
-harness, with ball joints at both ends of each leg, so that a leg carries force along its
-own line only. Legs stand on the *base* (torso side) and end on the *platform* (operator's
-side). A leg in **tension** is positive: it pulls the torso towards the operator, with
-force f_i along u_i, the unit vector from base to platform.
+The sensor is a Stewart platform of six load cells between the torso and the operator's harness,
+with ball joints at both ends of each leg, so that a leg carries force along its own line only. Legs
+begin on the *base* (torso side) and end on the *platform* (operator's side). A leg in **tension**
+is positive: it pulls the torso towards the operator, with force f_i along u_i, the unit vector from
+base to platform.
 
-Everything is in torso axes, relative to the harness point, which is the platform's
-centre (an assumption, as is the sensor's axis: along the torso's x, operator in front).
-The layout is the usual 6-6 hexapod: three pairs of points on each circle, the platform's
-pairs turned by 60 degrees against the base's, each leg going from its base point to the
-nearest platform point. The half angle inside a pair is what makes it work: at 30 degrees
-both hexagons are regular and alike, and the platform can twist freely (singular).
+Everything is in torso axes, relative to the harness point, which is the platform's centre (an
+assumption, as is the sensor's axis: along the torso's x, operator in front). The layout is the
+usual 6-6 hexapod: three pairs of points on each circle, the platform's pairs turned by 60 degrees
+against the base's, each leg going from its base point to the nearest platform point. The half angle
+inside a pair matters: at 30 degrees both hexagons are regular and alike, and the platform can twist
+freely (singular).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PAIR_HALF_ANGLE: Final = math.radians(15.0)
 """Half the angle between the two points of a pair, on both circles (assumption)."""
 
 CONDITION_MAX: Final = 100.0
-"""Largest condition number of G in use: beyond it, a load cell's error grows too much."""
+"""Maximum condition number of G; beyond it, a load cell's error grows too much."""
 
 
 def leg_points(base_radius: float, platform_radius: float, height: float) -> tuple[Matrix, Matrix]:
@@ -70,9 +70,11 @@ def geometry_matrix(base_radius: float, platform_radius: float, height: float) -
     if not condition <= CONDITION_MAX:
         found = (
             f"base_radius {base_radius:g} m, platform_radius {platform_radius:g} m and height "
-            f"{height:g} m give a geometry matrix of condition number {condition:.3g}"
+            f"{height:g} m give a geometry matrix with condition number {condition:.3g}"
         )
-        right = f"at most {CONDITION_MAX:g}: the radii and the height must be of similar size"
+        right = (
+            f"must be at most {CONDITION_MAX:g}: the radii and the height must be of similar size"
+        )
         raise ConfigError("robot file", "harness", found, right)
     return G
 

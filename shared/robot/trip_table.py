@@ -1,7 +1,7 @@
-"""What trips the robot out of being led, what then happens, and what lets it lead again.
+"""Table of trips: their causes, their effects, and what lets the robot lead again.
 
-A trip asks nobody: the module, or all six by the planner's word, goes to HOLD, which needs no one.
-The limits and times stand in [trips] of the robot file. `xrl faults` prints the table.
+On a trip the module, or all six at the planner's request, goes to HOLD, which needs no planner. The
+limits and times are in [trips] of the robot file. `xrl faults` prints the table.
 """
 
 from __future__ import annotations
@@ -27,30 +27,29 @@ from shared.robot.fault_table import FALLEN_REMEDY, recovery_of
 
 WEARING: Final[dict[int, str]] = {
     Wearing.LEADS: "",
-    Wearing.RESTS: "parked: a tug up opens it",
-    Wearing.AWAY: "parked, and nobody touches it",
-    Wearing.PULLS: "somebody pulls along the floor",
-    Wearing.BUMPED: "parked; a bump did not open it",
+    Wearing.RESTS: "parked: tug up to unpark it",
+    Wearing.AWAY: "parked: nobody touches it",
+    Wearing.PULLS: "somebody pulls horizontally",
+    Wearing.BUMPED: "parked: a bump did not unpark it",
 }
-"""What a status says of the person, by its `wearer`."""
+"""Text of a status about the wearer, by its `wearer`."""
 
 
 class TripRow(NamedTuple):
     """One trip."""
 
     key: str
-    """In [trips] of the robot file."""
+    """Key in [trips] of the robot file."""
     measured: str
     unit: str
     recovery: str
-    """Remedy."""
     least: bool = False
-    """Trips below its limit, not above."""
+    """True if it trips below its limit, not above."""
 
 
 _GAINS: Final = (
-    "the drivetrain is softer, or later, than [robustness] of the robot file says: compare, then "
-    "`xrl gains`"
+    "the drivetrain is softer, or has more delay, than [robustness] of the robot file says: "
+    "compare them, then run `xrl gains`"
 )
 
 JOINT_TRIPS: Final[dict[Cause, TripRow]] = {
@@ -59,64 +58,66 @@ JOINT_TRIPS: Final[dict[Cause, TripRow]] = {
     ),
     Cause.TORQUE_LIMIT: TripRow(
         "torque_limit", "its torque at the limit of its motors", "of tau_module_max",
-        "take load off; is a leg caught, or does it stand on an edge?",
+        "reduce the load; check whether a leg is caught or stands on an edge",
     ),
     Cause.TOO_FAST: TripRow(
-        "speed", "its joint's speed", "rad/s", "lead more slowly; is its encoder sound?"
+        "speed", "its joint's speed", "rad/s", "lead more slowly; check its encoder"
     ),
 }  # fmt: skip
-"""By a joint service, while it tracks; the others follow by the planner's word. After its wait,
-which each doubles, it may be led again."""
+"""Trips of a joint service while it tracks; the planner then holds the others. After its wait,
+which each trip doubles, it may be led again."""
 
 PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
     Trip.LEGS: TripRow(
         "legs", "the legs disagree about the torso", "m",
-        "stand both soles flat; if it lasts: `xrl drive zero`",
+        "put both soles flat on the floor; if it persists, run `xrl drive zero`",
     ),
     Trip.REACH: TripRow(
-        "reach", "the reference pose is out of reach", "m", "lead back to where the legs reach"
+        "reach", "the reference pose is out of reach", "m", "lead back within the legs' reach"
     ),
     Trip.TRACKING: TripRow(
         "tracking", "a joint is far from its reference", "rad",
-        "let it move freely; is a joint caught, or its zero wrong?",
+        "let it move freely; check whether a joint is caught or its zero is wrong",
     ),
     Trip.UNLOADED: TripRow(
-        "unloaded", "a leg carries hardly anything", "N", "stand on both feet", least=True
+        "unloaded", "a leg carries almost no load", "N", "stand on both feet", least=True
     ),
     Trip.SINKING: TripRow("sinking", "it sinks or rises fast", "m/s", "lead more slowly"),
     Trip.TURNING: TripRow("turning", "the torso turns fast", "rad/s", "lead more slowly"),
     Trip.HARNESS: TripRow(
-        "harness", "the person is carried otherwise than asked", "N",
-        "take weight off the harness, or ask for more assist",
+        "harness", "the force on the wearer differs from the requested assist", "N",
+        "take weight off the harness, or request more assist",
     ),
     Trip.SAGGING: TripRow(
         "sagging", "the person sinks with weight on the harness", "W",
-        "let the person stand up; ask for more assist, or lead down more slowly",
+        "let the person stand up; request more assist, or lead down more slowly",
     ),
     Trip.UNATTENDED: TripRow(
-        "unattended", "it drifts with nobody's hand on it", "m",
-        "take hold of it: it leads again a second later",
+        "unattended", "it drifts without a hand on it", "m",
+        "take hold of it; the planner leads again a second later",
     ),
     Trip.EDGE: TripRow(
         "edge", "a sole is loaded near its edge, sideways", "of its half width",
-        "do not lean on it from the side: it leads again a second later",
+        "do not lean on it from the side; the planner leads again a second later",
     ),
     Trip.TIPPING: TripRow(
         "tipping", "a sole is loaded at its edge, sideways", "of its half width",
-        "do not shove it from the side: it leads again a second later",
+        "do not push it from the side; the planner leads again a second later",
     ),
     Trip.OFF_BALANCE: TripRow(
         "balance", "its COM is ahead of or behind where it is held", "m",
-        "do not push it: it leads again a second later; if nobody does, `xrl kill planner`",
+        "do not push it; the planner leads again a second later. If nobody pushes, run "
+        "`xrl kill planner`",
     ),
 }  # fmt: skip
-"""By the planner, while it leads. It leads again once all is within its limits for a second."""
+"""Trips of the planner while it leads. It leads again once every value has been within its limit
+for a second."""
 
 
 def limits_of(config: RobotConfig) -> TripsConfig:
     """Return the robot's limits; with gains that no schedule certifies nothing trips.
 
-    The paper's split is there to be compared with: 20 ms late it shakes, and that is to be seen.
+    The paper's split serves for comparison: 20 ms late it shakes, and a trip would hide that.
     """
     return config.trips if config.law.split == "certified" else _NEVER
 
@@ -124,7 +125,7 @@ def limits_of(config: RobotConfig) -> TripsConfig:
 def untripped(config: RobotConfig) -> RobotConfig:
     """Return the robot without trips, as a baseline for studies only.
 
-    Its load is not estimated either: shaking would be taken for a load, and the robot would not be
+    Its load is not estimated either: shaking would look like a load, and the robot would not be
     led.
     """
     law = msgspec.structs.replace(config.law, load_correction=(0.0, 0.0))
@@ -138,13 +139,13 @@ _NEVER: Final = TripsConfig(
     }
 )
 
-# ---- one text of what helps, for status, page and ROS 2
+# ---- remedies, in the same words for status, page and ROS 2
 
 RESTART: Final = "xrl kill MODULE"
 """Its supervisor starts it again."""
 REARM: Final = "xrl rearm"
 """All six modules together, or none."""
-OTHER_VERSION: Final = "its service is of another version: the same checkout on every host"
+OTHER_VERSION: Final = "its service has another version: use the same checkout on every host"
 
 
 def remedy_of(state: JointState) -> str:
@@ -155,27 +156,27 @@ def remedy_of(state: JointState) -> str:
     except ValueError:  # a code that this version does not know
         return OTHER_VERSION
     if mode is Mode.FAULT:
-        return f"{recovery_of(cause)}; then {RESTART}"
+        return f"{recovery_of(cause)}; then run {RESTART}"
     if mode is Mode.DAMP:
         return FALLEN_REMEDY if cause is Cause.FALLEN else REARM
     if drive is DriveStatus.UNZEROED:
-        return "hang the robot, xrl drive zero"
+        return "hang the robot, then run xrl drive zero"
     if drive is DriveStatus.UNACKNOWLEDGED:
-        return "nobody acknowledges on its CAN bus: power of drive and adapter, cable"
+        return "no node acknowledges on its CAN bus: check power of drive and adapter, and cable"
     if drive is DriveStatus.HOLDING:
-        return "by itself, with the planner: the drive holds"
+        return "automatic once the planner runs: the drive holds"
     if mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):
-        return f"if it lasts: its log says why; hang the robot, then {RESTART}"
+        return f"if it persists, its log says why; hang the robot, then run {RESTART}"
     if mode is Mode.HOLD and cause in JOINT_TRIPS:
-        return f"by itself, after a wait; if again: {JOINT_TRIPS[cause].recovery}"
+        return f"automatic, after a wait; if it trips again: {JOINT_TRIPS[cause].recovery}"
     if outside:
         refused = f"the planner's {outside.name.lower()} is refused"
-        return f"{refused}: by itself after a push or a stall; if it lasts, xrl kill planner"
+        return f"{refused}: automatic after a push or a stall; if it persists, run xrl kill planner"
     return ""
 
 
 def reason_of(status: PlannerStatus) -> str:
-    """Return why the planner does not lead and what helps, where its mode does not say it all."""
+    """Return why the planner does not lead, and the remedy, beyond what its mode says."""
     if status.trip not in PLANNER_TRIPS:
         return status.why
     return f"{status.why}: {PLANNER_TRIPS[Trip(status.trip)].recovery}"

@@ -175,7 +175,7 @@ class Bench(BenchJoint):
         self.run(400, fresh=True, **changes)
 
     def to(self, mode: Mode) -> None:
-        """Bring the controller into a mode by what brings it there on the robot."""
+        """Bring the controller into a mode by what includes it there on the robot."""
         if mode is Mode.DISARMED:
             self.status = DriveStatus.IDLE
             self.cycle()

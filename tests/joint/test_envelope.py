@@ -221,7 +221,7 @@ def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_w
         after: JointCommand | None = last,
     ) -> float:  # fmt: skip
         lately = Lately(energy=before, at_ns=T0)
-        return knee.lately(told, after, lately, v, T0 + round(dt * NS_PER_S)).energy
+        return knee.accumulated(told, after, lately, v, T0 + round(dt * NS_PER_S)).energy
 
     found = [0.0]
     for _ in range(1000):
@@ -234,7 +234,9 @@ def test_the_work_of_a_coupled_torque_on_a_joint_that_moves_is_what_it_puts_in_w
     assert put(9.0, v, dt=1.0, told=command()) == 0.0, "it is forgotten"
     for other in (None, command(hold=True), command(session=SESSION + 1)):
         assert put(9.0, v, after=other) == 0.0
-    assert knee.lately(last, last, Lately(), v, T0) == Lately(at_ns=T0), "none before the first"
+    assert knee.accumulated(last, last, Lately(), v, T0) == Lately(at_ns=T0), (
+        "none before the first"
+    )
 
 
 def going(tick: int, told: Pair, goes: Pair) -> JointCommand:
@@ -247,7 +249,7 @@ def astray_after(ticks: int, told: Pair, goes: Pair, every: int = 1, module: str
     envelope, lately, last = Envelope(ROBOT, module), Lately(), going(0, told, goes)
     for tick in range(every, ticks + 1, every):
         after = going(tick, told, goes)
-        lately, last = envelope.lately(after, last, lately, V, T0), after
+        lately, last = envelope.accumulated(after, last, lately, V, T0), after
     return lately.astray
 
 
@@ -274,7 +276,7 @@ def test_where_nothing_of_this_planner_is_tracked_nothing_is_astray() -> None:
     held = msgspec.structs.replace(after, hold=True)
     pairs = [(after, None), (after, command(hold=True)), (after, command(session=SESSION + 1))]
     for told, last in (*pairs, (held, command())):
-        lately = Envelope(ROBOT, ANKLE).lately(told, last, Lately(astray=(0.5, 0.5)), V, T0)
+        lately = Envelope(ROBOT, ANKLE).accumulated(told, last, Lately(astray=(0.5, 0.5)), V, T0)
         assert lately.astray == pd_law.ZERO
 
 

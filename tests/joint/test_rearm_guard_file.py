@@ -229,7 +229,9 @@ def test_the_memory_of_a_service_takes_its_space_when_it_is_made(tmp_path: Path)
 
 def test_memory_that_cannot_be_made_is_refused_by_its_name(tmp_path: Path) -> None:
     path_of(tmp_path, MODULE).mkdir(parents=True)
-    with pytest.raises(FleetError, match=rf"{MODULE}\.rearm: no shared memory: Is a directory"):
+    with pytest.raises(
+        FleetError, match=rf"{MODULE}\.rearm: cannot create shared memory: Is a directory"
+    ):
         RearmGuard(tmp_path, MODULE)
 
 

@@ -25,7 +25,7 @@ STILL: Pair = (0.0, 0.0)
 def tripped_ms(taus: list[Pair], v: Pair = STILL) -> tuple[Event, float | None]:
     """Return the first trip and how long it took, ms, of these torques cycle by cycle."""
     trips, limits = JointTrips(), limits_of(ROBOT)
-    trips.rest(taus[0])
+    trips.reset(taus[0])
     for cycle, tau in enumerate(taus):
         event = trips.judge(T0 + cycle * CYCLE_NS, tau, v, limits)
         if event is not Event.NONE:
@@ -53,7 +53,7 @@ def test_shaking_is_the_mean_square_above_its_band_of_either_axis() -> None:
     for axis in (0, 1):
         for sign in (-1.0, 1.0):
             trips = JointTrips()
-            trips.rest(STILL)
+            trips.reset(STILL)
             jump = (sign * 9.0, 0.0) if axis == 0 else (0.0, sign * 9.0)
             trips.judge(T0, jump, STILL, limits)
             left = 9.0 * (1.0 - limits.slow_share)

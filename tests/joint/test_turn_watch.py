@@ -24,6 +24,7 @@ from services.joint.turn_watch import (
     FADES,
     GAP_NS,
     SETTLES_S,
+    STICTION,
     STILL,
     STILL_NS,
     TurnWatch,
@@ -63,7 +64,7 @@ class Axis:
     ) -> Event:
         pos, vel = (self.estimate, 0.0), (self.vel, 0.0)
         reading = DriveReading(self.t_ns, pos, vel, status, error, None, zero)
-        return self.samples.take(reading, armed=armed)
+        return self.samples.process(reading, armed=armed)
 
     def move(self, acceleration: float, word: float | None, *, armed: bool = True) -> Event:
         """Move for a period; the encoder then says a word within the turn, or none."""
@@ -161,6 +162,25 @@ def test_an_encoder_that_reads_0_is_noticed_from_any_angle(in_turn: float, armed
         assert axis.samples.turns_lost is reads_zero
 
 
+@pytest.mark.parametrize(
+    ("change", "dead"), [(0.0, False), (STICTION - 1.0, False), (STICTION + 1.0, True)]
+)
+def test_an_axis_that_rests_at_its_encoders_0_is_dead_only_if_a_torque_does_not_move_it(
+    change: float, dead: bool
+) -> None:
+    """A parked robot rested a live motor there, and the module lost its torque."""
+    watch = TurnWatch(encoder_zero=0.3)
+    for cycle in range(100):
+        torque = 20.0 + change * (cycle > 50)
+        pos = 2.3 + 1e-3 * max(0, 10 - cycle)  # it comes to rest slowly
+        assert watch.process(T_NS + cycle * PERIOD_NS, pos, 0.0, 0.0, 1.0, torque)
+    assert watch.lost is dead
+    idle = TurnWatch(encoder_zero=0.3)
+    for cycle in range(100):
+        idle.process(T_NS + cycle * PERIOD_NS, 2.3, 0.0, 0.0, 1.0, None)
+    assert idle.lost, "it does not arm"
+
+
 def test_a_position_is_at_the_encoders_0_within_three_counts_on_either_side() -> None:
     watch = TurnWatch(encoder_zero=0.3)
     for turns in (0.0, 3.0, -2.0):
@@ -176,7 +196,7 @@ def test_an_idle_axis_that_jumps_has_moved_until_its_encoders_0_is_told(axis: in
     def take(t_ns: int, zero: Pair | None = None) -> bool:
         pos = (at[0], at[1])
         reading = DriveReading(t_ns, pos, (0.0, 0.0), DriveStatus.IDLE, 0, None, zero)
-        samples.take(reading, armed=False)
+        samples.process(reading, armed=False)
         return samples.moved
 
     assert not take(T_NS, (0.1, 0.1))
@@ -209,7 +229,7 @@ def rested(slowest: float, fastest: float, rested_ns: int) -> TurnWatch:
 
 def goes_on(watch: TurnWatch, jump: float) -> bool:
     """Return True if the watch says that the motor may have gone so far, unseen, in its rest."""
-    return watch.take(T_NS, jump, 0.0, jump, -1.0)  # seen, it cannot have gone at all
+    return watch.process(T_NS, jump, 0.0, jump, -1.0, 0.0)  # seen, it cannot have gone at all
 
 
 def reach(slowest: float, fastest: float, blind_s: float) -> tuple[float, float]:
@@ -253,18 +273,18 @@ def test_a_rest_is_a_gap_from_two_periods_on_up_to_what_the_drive_reports_itself
 
 def test_an_axis_that_is_seen_goes_as_far_as_it_is_free_to_and_rests_within_a_third_count() -> None:
     for jump, possible in ((0.25, True), (-0.25, True), (0.26, False)):
-        assert TurnWatch().take(T_NS, jump, 0.0, jump, 0.25) is possible
+        assert TurnWatch().process(T_NS, jump, 0.0, jump, 0.25, 0.0) is possible
     watch = TurnWatch(0.0, 5)
-    watch.take(T_NS, STILL, 0.0, STILL, 1.0)
+    watch.process(T_NS, STILL, 0.0, STILL, 1.0, 0.0)
     assert (watch.pos, watch.changed_ns) == (0.0, 5)
 
 
 def test_the_bounds_of_the_speed_follow_it_no_faster_than_a_motor_can() -> None:
     """Outwards by its largest acceleration, inwards by half of it; after a long rest it is 0."""
     watch = TurnWatch(0.0, T_NS, 10.0, 10.0, T_NS)
-    watch.take(T_NS + PERIOD_NS, 0.02, -10.0, 0.02, 1.0)
+    watch.process(T_NS + PERIOD_NS, 0.02, -10.0, 0.02, 1.0, 0.0)
     assert (watch.slowest, watch.fastest) == pytest.approx((9.2, 9.6))
-    watch.take(T_NS + 2 * GAP_NS, 0.02, 0.0, 0.0, 1.0)
+    watch.process(T_NS + 2 * GAP_NS, 0.02, 0.0, 0.0, 1.0, 0.0)
     assert (watch.slowest, watch.fastest) == (0.0, 0.0)
 
 
@@ -283,7 +303,7 @@ def reading(
 @pytest.fixture
 def samples() -> JointEstimate:
     samples = JointEstimate(N)
-    samples.take(reading(T_NS), armed=True)
+    samples.process(reading(T_NS), armed=True)
     return samples
 
 
@@ -295,7 +315,7 @@ def test_a_motor_moves_no_further_than_its_speed_and_a_margin_explain(
     before = list(samples.pos)
     moved = list(before)
     moved[motor] += JUMP_TURNS + JUMP_SPEED * 2e-3 + beyond
-    event = samples.take(reading(T_NS + PERIOD_NS, (moved[0], moved[1])), armed=True)
+    event = samples.process(reading(T_NS + PERIOD_NS, (moved[0], moved[1])), armed=True)
     assert event is (Event.DRIVE_ARMED if accepted else Event.NONE)
     assert list(samples.pos) == (moved if accepted else before)
     assert samples.q == joint_from_motor(samples.pos, N)
@@ -306,8 +326,8 @@ def test_a_motor_moves_no_further_than_its_speed_and_a_margin_explain(
     [((60.0, 0.0), (1.12, -2.0)), ((0.0, 60.0), (1.0, -1.88)), ((0.0, -60.0), (1.0, -2.12))],
 )
 def test_a_fast_motor_may_go_on_fast(samples: JointEstimate, vel: Pair, moved: Pair) -> None:
-    samples.take(reading(T_NS + PERIOD_NS, vel=vel), armed=True)
-    assert samples.take(reading(T_NS + 2 * PERIOD_NS, moved), armed=True) is Event.DRIVE_ARMED
+    samples.process(reading(T_NS + PERIOD_NS, vel=vel), armed=True)
+    assert samples.process(reading(T_NS + 2 * PERIOD_NS, moved), armed=True) is Event.DRIVE_ARMED
     assert samples.pos == moved
 
 
@@ -315,9 +335,11 @@ def test_a_fast_motor_may_go_on_fast(samples: JointEstimate, vel: Pair, moved: P
 def test_a_speed_beyond_any_motors_excuses_no_jump(samples: JointEstimate, speed: float) -> None:
     before = samples.pos
     for axis in ((speed, 0.0), (0.0, speed)):
-        assert samples.take(reading(T_NS + PERIOD_NS, vel=axis), armed=True) is Event.NONE
+        assert samples.process(reading(T_NS + PERIOD_NS, vel=axis), armed=True) is Event.NONE
         assert samples.vel == (0.0, 0.0)
-    assert samples.take(reading(T_NS + PERIOD_NS, (9.0, -2.0)), armed=True) is not Event.DRIVE_ARMED
+    assert (
+        samples.process(reading(T_NS + PERIOD_NS, (9.0, -2.0)), armed=True) is not Event.DRIVE_ARMED
+    )
     assert samples.pos == before
 
 
@@ -329,7 +351,7 @@ def test_a_few_odd_samples_in_a_row_and_the_position_is_lost(
     events = []
     for k in range(1, REJECTED_MAX + 1 if in_a_row else 4 * REJECTED_MAX):
         pos = (5.0 if in_a_row or k % REJECTED_MAX else 1.0, -2.0)
-        events.append(samples.take(reading(T_NS + k * PERIOD_NS, pos), armed=True))
+        events.append(samples.process(reading(T_NS + k * PERIOD_NS, pos), armed=True))
     assert (Event.POSITION_LOST in events) is in_a_row
     assert events[: REJECTED_MAX - 1] == [Event.NONE] * (REJECTED_MAX - 1)
     assert samples.pos == (1.0, -2.0)
@@ -339,7 +361,7 @@ def test_a_module_that_is_not_controlled_may_be_found_anywhere(samples: JointEst
     """An axis that disarms is reported even by an odd sample."""
     odd = reading(T_NS + PERIOD_NS, (9.0, 9.0), status=DriveStatus.ERROR)
     for armed in (True, False):
-        assert samples.take(odd, armed=armed) is Event.DRIVE_DISARMED
+        assert samples.process(odd, armed=armed) is Event.DRIVE_DISARMED
         assert samples.pos == ((1.0, -2.0) if armed else (9.0, 9.0))
 
 
@@ -351,7 +373,7 @@ def test_a_position_that_is_old_or_means_nothing_is_not_taken(
     samples: JointEstimate, status: DriveStatus, event: Event
 ) -> None:
     for armed in (True, False):
-        assert samples.take(
+        assert samples.process(
             reading(T_NS + PERIOD_NS, (-63.0, -62.0), status=status), armed=armed
         ) is (event)
     assert samples.pos == (1.0, -2.0)
@@ -364,18 +386,18 @@ def test_a_drive_without_a_zero_may_lack_turns_on_both_axes_if_it_was_controlled
 ) -> None:
     """Only a joint that nobody controls has moved by a jump."""
     jumped = JointEstimate(N)
-    jumped.take(reading(T_NS), armed=True)
-    jumped.take(reading(T_NS + PERIOD_NS, (9.0, 9.0)), armed=armed)
+    jumped.process(reading(T_NS), armed=True)
+    jumped.process(reading(T_NS + PERIOD_NS, (9.0, 9.0)), armed=armed)
     assert (jumped.first.moved, jumped.second.moved) == (not armed, not armed)
-    samples.take(reading(T_NS + PERIOD_NS, status=DriveStatus.UNZEROED), armed=armed)
+    samples.process(reading(T_NS + PERIOD_NS, status=DriveStatus.UNZEROED), armed=armed)
     assert (samples.first.lost, samples.second.lost, samples.accepted_ns) == (armed, armed, 0)
 
 
 @given(speed=st.floats(-40.0, 40.0), gained=st.floats(-8.0, 8.0), gap_ms=st.integers(1, 100))
 def test_a_joint_that_moves_as_legs_do_is_right(speed: float, gained: float, gap_ms: int) -> None:
     samples = JointEstimate(N)
-    samples.take(reading(T_NS, vel=(speed, 0.0)), armed=True)
+    samples.process(reading(T_NS, vel=(speed, 0.0)), armed=True)
     dt = gap_ms * 1e-3
     pos = (1.0 + (speed + gained * dt / 0.1) * dt, -2.0)
     later = reading(T_NS + gap_ms * NS_PER_MS, pos)
-    assert samples.take(later, armed=True) is Event.DRIVE_ARMED
+    assert samples.process(later, armed=True) is Event.DRIVE_ARMED

@@ -40,7 +40,7 @@ class Own:
         """Nothing."""
 
     def step(self, seen: Observation) -> Action:
-        action = Action.of(seen.law)
+        action = Action.from_law(seen.law)
         return self._change(seen, action) if seen.time_s > BEGINS_S else action
 
 

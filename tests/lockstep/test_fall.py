@@ -91,7 +91,7 @@ def test_with_an_imu_every_fall_is_found_within_0_3_s_and_all_let_go(number: int
         Cause.FALLEN
     }
     status = status_of(run.fleet)
-    assert "it has fallen" in status.why
+    assert "the robot has fallen" in status.why
     assert "xrl rearm" in status.why
 
 

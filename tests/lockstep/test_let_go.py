@@ -92,9 +92,9 @@ def test_a_pitched_torso_stays_whatever_the_person_rests_on_it(
     ("errors", "words"),
     [
         ({"body.com_offset": [-0.05, 0.0, 0.1]}, "lies too far behind"),
-        ({"body.payload_scale": 0.0}, "kg less than its file says"),
-        ({"body.payload_scale": 0.5}, "kg less than its file says"),
-        ({"body.payload_scale": 1.5}, "kg more than its file says"),
+        ({"body.payload_scale": 0.0}, "kg less than the robot file says"),
+        ({"body.payload_scale": 0.5}, "kg less than the robot file says"),
+        ({"body.payload_scale": 1.5}, "kg more than the robot file says"),
     ],
 )
 def test_half_a_payload_too_much_or_too_little_or_too_far_back_is_not_led(

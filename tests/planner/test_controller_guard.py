@@ -55,10 +55,10 @@ def test_each_planner_gets_one_of_its_own_made_of_the_robot(mine: Path, name: st
 @pytest.mark.parametrize(
     ("text", "name", "said"),
     [
-        (GOOD, ":Absent", "has no Absent; a class or function Absent"),
+        (GOOD, ":Absent", "has no Absent; define a class or function Absent"),
         ("def Controller(robot): return 3", "", "has no reset and no step"),
         ("class Controller:\n  def reset(self, s): pass\n  def __init__(self, r): pass", "",
-         "has no step; reset"),
+         "has no step; define reset"),
         ("def Controller(): pass", "", "raised TypeError"),
         ("import nowhere_to_be_found", "", "raised ModuleNotFoundError: No module named"),
         ("def (", "", "raised SyntaxError"),
@@ -112,12 +112,12 @@ class Scripted:
 
 
 def changed(**parts: Any) -> Callable[[Observation], Action]:
-    return lambda seen: Action.of(seen.law)._replace(**parts)
+    return lambda seen: Action.from_law(seen.law)._replace(**parts)
 
 
 def scaled(scale: float) -> Callable[[Observation], Action]:
     """Return what scales the local stiffness."""
-    return lambda seen: Action.of(seen.law)._replace(D=scale * seen.law.local.D)
+    return lambda seen: Action.from_law(seen.law)._replace(D=scale * seen.law.local.D)
 
 
 def guarding(controller: Scripted, hocca: Hocca) -> Kept:
@@ -137,7 +137,7 @@ def test_what_is_the_shipped_laws_stays_it_to_the_last_bit(hocca: Hocca, seen: O
     mine = Scripted(changed())
     found = guarding(mine, hocca).act(seen, leads=True)
     assert (mine.resets, mine.steps) == (1, 1)
-    for own, shipped in zip(Action.of(found), Action.of(seen.law), strict=True):
+    for own, shipped in zip(Action.from_law(found), Action.from_law(seen.law), strict=True):
         assert np.array_equal(own, shipped)
     assert found.local.margins == seen.law.local.margins
     assert found.local.source is SplitSource.CONTROLLER
@@ -162,7 +162,7 @@ def raises(_seen: Observation) -> Action:
 NAN = np.full(12, math.nan)
 BAD = {
     "None": lambda _: None,
-    "a tuple": lambda seen: tuple(Action.of(seen.law)),
+    "a tuple": lambda seen: tuple(Action.from_law(seen.law)),
     "raises": raises,
     "too short": changed(q_ref=np.zeros(11)),
     "a matrix": changed(D=np.ones((12, 1))),
@@ -183,7 +183,7 @@ def test_what_is_no_action_holds_all(hocca: Hocca, seen: Observation, name: str)
     for tick in range(3):
         found = (guard if tick < 2 else again).act(seen, leads=True)
         assert found.local.source is SplitSource.UNCERTIFIED
-        for part, shipped in zip(Action.of(found), Action.of(seen.law), strict=True):
+        for part, shipped in zip(Action.from_law(found), Action.from_law(seen.law), strict=True):
             assert np.array_equal(part, shipped), "nothing of it is sent"
         assert guard.state.why.startswith("the controller r")
         again.state = copied(guard.state)
@@ -242,7 +242,7 @@ def test_what_it_sees_cannot_be_written(hocca: Hocca, seen: Observation) -> None
 
         def write(shown: Observation, part: str = part) -> Action:
             getattr(shown, part)[...] = 0.0
-            return Action.of(shown.law)
+            return Action.from_law(shown.law)
 
         guard = guarding(Scripted(write), hocca)
         before = getattr(seen, part).copy()
@@ -266,4 +266,4 @@ def test_references_off_the_soles_are_not_sent(hocca: Hocca, seen: Observation) 
     lean = Scripted(changed(q_ref=seen.law.q_ref + 0.08 * seen.T[:, 0]))
     guard = guarding(lean, hocca)
     assert guard.act(seen, leads=True).local.source is SplitSource.UNCERTIFIED
-    assert guard.state.why.startswith("the rest in HOLD is at ")
+    assert guard.state.why.startswith("the rest position in HOLD is at ")

@@ -120,7 +120,7 @@ def test_it_rests_where_it_is_while_it_is_not_led() -> None:
     follower = Kept(ShiftReference(LARGEST), ShiftState())
     for _ in range(100):
         there, _ = advanced(follower, (0.03, 0.0, 0.0, 0.1), DT)
-    follower.state.rest()
+    follower.state.stop()
     shift, rate = now(follower)
     np.testing.assert_array_equal(shift, there)
     assert not rate.any()

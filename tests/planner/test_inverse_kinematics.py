@@ -211,7 +211,7 @@ def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(ik: ReachSolver
     assert reach.outcome is IkEnding.JOINT_LIMIT
     assert reach.stopped == (0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0)
     assert describe(reach, TOO_HIGH, LIMITS) == (
-        "p_ref cannot be reached: COM z 1.31 m wanted, 0.93 m is the closest: "
+        "p_ref cannot be reached: COM z 1.31 m requested, 0.93 m is the closest: "
         "knee_right_theta at its limit -0.2 rad, knee_left_theta at its limit -0.2 rad"
     )
     wide = LIMITS.copy()

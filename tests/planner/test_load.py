@@ -244,15 +244,15 @@ def test_far_from_the_file_it_is_refused_and_does_not_flap(
 
 
 TARE = (
-    "the robot carries {} than its file says, or its harness measures wrongly: at most 8 kg are "
-    "accepted (6.4 once refused); tare the unloaded harness (`xrl drive tare`) first; if that "
-    "changes nothing{}, set mass.payload, then `xrl gains`"
+    "the robot carries {} than the robot file says, or its harness measures wrongly: at most 8 kg "
+    "is accepted (6.4 once refused). First tare the unloaded harness (`xrl drive tare`); if that "
+    "changes nothing{}, set mass.payload, then run `xrl gains`"
 )
 HANGS = (
-    "it hangs: lower it until its feet bear its weight; or, on its feet, it carries 50 kg less "
-    "than its file says: set mass.payload, then `xrl gains`"
+    "the robot hangs: lower it until its feet bear its weight. If it stands, it carries 50 kg less "
+    "than the robot file says: set mass.payload, then run `xrl gains`"
 )
-LIES = "the load lies too far {}: at most 20 N m are accepted (16 once refused)"
+LIES = "the load lies too far {}: at most 20 N m is accepted (16 once refused)"
 MORE, LESS = TARE.format("9.0 kg more", ""), TARE.format("9.0 kg less", " and nothing holds it up")
 
 

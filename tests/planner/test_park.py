@@ -47,7 +47,7 @@ class Worn:
         for _ in range(0, lasts_ns, TICK_NS):
             self.now_ns += TICK_NS
             self.assist = self.law.advance(self.state, self.now_ns, touch, park, DT, may=may)
-        return self.state.shown(self.now_ns)
+        return self.state.reported(self.now_ns)
 
 
 @pytest.fixture

@@ -182,7 +182,7 @@ def test_the_papers_split_is_the_diagonal(stand: Stand) -> None:
 def test_a_certified_split_without_its_schedule_is_refused() -> None:
     mass = msgspec.structs.replace(ROBOT.mass, payload=5.0)
     for changed, found in (
-        (msgspec.structs.replace(ROBOT, gain_schedule=None), "no gain schedule"),
+        (msgspec.structs.replace(ROBOT, gain_schedule=None), "the gain schedule is missing"),
         (msgspec.structs.replace(ROBOT, mass=mass), "mass.payload = 20.4, not 5.0"),
     ):
         with pytest.raises(ConfigError, match="xrl gains") as caught:

@@ -145,11 +145,11 @@ def test_a_folder_that_is_removed_is_told_at_once_and_recording_goes_on_in_the_n
     run.run(1.0)
     shutil.rmtree(out)
     run.run(0.5)
-    assert "run.mcap was removed while it was written, with" in caplog.text
+    assert "run.mcap was removed while being written, with" in caplog.text
     run.run(1.0)
     run.finish()
     log = read_run(out / "run_1.mcap")
-    assert log.metadata["split"]["why"] == "the file before was removed"
+    assert log.metadata["split"]["why"] == "the previous file was removed"
     kept, lost = log.count(STATE_KEY), run.recording.removed_messages
     assert (kept + lost, run.recording.removed_files) == (run.sent, 1)
     assert lost <= 1.3 * 500
@@ -175,7 +175,7 @@ def test_a_folder_that_is_removed_at_the_end_is_told_too(
     shutil.rmtree(tmp_path / "out")
     run.finish()
     assert run.recording.removed_files == 1
-    assert "was removed while it was written, with" in caplog.text
+    assert "was removed while being written, with" in caplog.text
     logger = logging.getLogger("test")
     assert recorder._tell_end(run.writer, run.recording, "", logger) == 2, "the exit code"
-    assert "1 of 1 files were removed while they were written" in caplog.text
+    assert "1 of 1 files were removed while being written" in caplog.text

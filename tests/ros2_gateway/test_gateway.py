@@ -287,5 +287,5 @@ def test_what_may_be_accepted(words: str, names: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("words", ["", ",", "all", "estop,command", "ESTOP"])
 def test_anything_else_is_one_clear_line(words: str) -> None:
-    with pytest.raises(FleetError, match="intent or estop or intent,estop is right"):
+    with pytest.raises(FleetError, match="must be intent, estop or intent,estop"):
         acceptable(words)

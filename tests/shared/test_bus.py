@@ -285,11 +285,11 @@ except BusError as error:
 
 
 SESSIONS_REFUSED = {
-    **dict.fromkeys(("", "a/b", "*", "a b"), ("", "no name for a process")),
+    **dict.fromkeys(("", "a/b", "*", "a b"), ("", "not a valid process name")),
     "planner": ("x" * 100, r"unixsock-stream/.*/planner\.zenoh.*shorter run directory"),
     "ankle_right": ("x" * 100, r"unixsock-stream/.*/ankle_right\.zenoh.*shorter run directory"),
     TOOL: ("x" * 100, r"unixsock-stream/.*shorter run directory"),
-    "harness": ("a?b", r"harness\.zenoh: no socket path with \? or #; choose another directory"),
+    "harness": ("a?b", r"harness\.zenoh: a socket path must not contain \? or #"),
     "simulator": ("file", r"file/simulator\.zenoh: simulator cannot listen: "),
 }
 """Name: folder below the run directory, and what the error says."""
@@ -382,10 +382,14 @@ def test_behind_a_slow_disk_a_bounded_number_of_batches_waits(recorded: Recorded
 
 
 USES_REFUSED: dict[str, Callable[[Session], object]] = {
-    "harness/wrench: Estop is not its type; use W": lambda s: s.publisher(topics.WRENCH, Estop),
-    r"joint/\*/command: '' is no module": lambda s: s.latest(topics.JOINT_COMMAND, JointCommand),
-    "leave the module out": lambda s: s.latest(topics.WRENCH, Wrench, "ankle_right"),
-    "in no batch": lambda s: s.latest_in_batch(topics.WRENCH, Wrench),
+    "harness/wrench: Estop is not its message type; use W": lambda s: s.publisher(
+        topics.WRENCH, Estop
+    ),
+    r"joint/\*/command: '' is not a valid module": lambda s: s.latest(
+        topics.JOINT_COMMAND, JointCommand
+    ),
+    "omit the module": lambda s: s.latest(topics.WRENCH, Wrench, "ankle_right"),
+    "not in a batch": lambda s: s.latest_in_batch(topics.WRENCH, Wrench),
     "xrl//estop": lambda s: s.stream(["xrl//estop"]),
 }
 

@@ -95,11 +95,11 @@ REFUSALS: list[Refusal] = [
     refusal("mass.payload", "heavy", "'heavy'", "float"),
     refusal("law.K_p", [1.0] * 5, "[1.0, 1.0, 1.0, 1.0, 1.0]", "length 6"),
     refusal("module.1.node_ids.1", "x", "'x'", "int"),
-    refusal("law.S.2", 7, "7", "one of 0, 1"),
+    refusal("law.S.2", 7, "7", "must be one of 0, 1"),
     refusal("can.harness.speed", 3, "unknown", "spelling"),
     # choices
     refusal("law.jacobian", "mean", "'mean'", "load_sharing"),
-    refusal("law.S.0", 1, "nobody would balance", "only z and pitch"),
+    refusal("law.S.0", 1, "the robot would not balance", "only z and pitch"),
     # ranges
     refusal("mass.battery", -0.9, "-0.9", "0 to 200 kg"),
     refusal("mass.payload", math.nan, "nan", "0 to 200 kg"),
@@ -118,13 +118,13 @@ REFUSALS: list[Refusal] = [
     (
         lambda raw: raw["imu"].update(fitted=True, bus="hip_left"),
         "imu.bus",
-        "'hip_left' is hip_left's bus too",
-        "one without drives",
+        "'hip_left' is also the bus of hip_left",
+        "a bus without drives",
     ),
     refusal("module.1.node_ids", [2, 2], "node 2", "free"),
     (on_one_bus, "module[1].node_ids", "node 1", "free"),
     (without("bus.endpoints.planner"), "bus.endpoints.planner", "missing", "each service"),
-    refusal("bus.endpoints.wheel", "tcp/a:1", "no such", "recorder"),
+    refusal("bus.endpoints.wheel", "tcp/a:1", "not a valid service", "recorder"),
     refusal("bus.endpoints.planner", "tcp/a:x", "", "HOST:PORT"),
     refusal("bus.endpoints.planner", "udp/a:1", "'udp/a:1'", "tcp/"),
     refusal("bus.endpoints.planner", "tcp/a:65536", "", "1 to 65535"),
@@ -132,7 +132,7 @@ REFUSALS: list[Refusal] = [
     refusal(
         "bus.endpoints.planner",
         "unixsock-stream/{Run}/planner.zenoh",
-        "{Run} is no placeholder",
+        "{Run} is not a valid placeholder",
         "only {run}",
     ),
     (
@@ -141,7 +141,9 @@ REFUSALS: list[Refusal] = [
         "99999",
         "localhost:7447",
     ),
-    refusal("bus.endpoints.harness", RAW["bus"]["endpoints"]["planner"], "planner", "one for each"),
+    refusal(
+        "bus.endpoints.harness", RAW["bus"]["endpoints"]["planner"], "planner", "another endpoint"
+    ),
     (setting("assumed", ["mass.module", "mass.wheel"]), "assumed[1]", "'mass.wheel'", "key"),
     *(
         (setting("assumed", [key]), "assumed[0]", f"'{key}'", "key")
@@ -149,8 +151,8 @@ REFUSALS: list[Refusal] = [
     ),
     # physics
     refusal("mass.payload", 20.5, "20.5", "at most 20.4 kg"),
-    refusal("limits.hip.phi", [1.0, -1.0], "[1, -1]", "low below high"),
-    refusal("limits.ankle.theta", [0.9, 0.9], "0.9", "low below high"),
+    refusal("limits.hip.phi", [1.0, -1.0], "[1, -1]", "lower limit must be below"),
+    refusal("limits.ankle.theta", [0.9, 0.9], "0.9", "lower limit must be below"),
     refusal("limits.knee.theta.1", 0.0, "0 rad", "negative"),
     refusal("limits.knee.theta.1", 0.1, "0.1 rad", "negative"),
     refusal("simulation.stand_height", 1.3, "1.3", "0.762 to 1.296"),
@@ -159,16 +161,16 @@ REFUSALS: list[Refusal] = [
     refusal("geometry.l1", 1.1, "1.1 m", "shorter than the shin"),
     refusal("drive.current_lim", 5.0, "5 A", "at least 39.9 A"),
     refusal("drive.current_lim", 60.5, "60.5 A", "at most 60 A"),
-    refusal("drive.vel_limit", 2.0, "2 turn/s", "at least 55.7 turn/s"),
+    refusal("drive.vel_limit", 2.0, "2 turn/s", "must be at least 55.7 turn/s"),
     (setting("joint_service.v_max", 22.0), "drive.vel_limit", "60 turn/s", "at least 61.3"),
     refusal("drive.zero_mark_turns", 8.0, "8 turns: the hip", "41"),
-    refusal("drive.zero_mark_turns", 0.0, "had no power", "41"),
+    refusal("drive.zero_mark_turns", 0.0, "lost power", "41"),
     (setting("joint.gear_ratio", 30.0), "drive.vel_limit", "60 turn/s", "at least 95.5"),
     refusal("can.harness.interface", "socketcam", "'socketcam'", "did you mean 'socketcan'?"),
-    refusal("drive.watchdog_timeout", 0.1, "0.1 s disarms", "0 s: off"),
+    refusal("drive.watchdog_timeout", 0.1, "0.1 s would disarm", "must be 0 s"),
     (setting("joint_service.loop", "service"), "drive.watchdog_timeout", "0 s", "at least 0.02"),
     refusal("drive.encoder_period_ms", 10, "10 ms", "2 ms"),
-    refusal("simulation.encoder_rate_hz", 50.0, "50 Hz", "500 Hz: they are its clock"),
+    refusal("simulation.encoder_rate_hz", 50.0, "50 Hz", "must be 500 Hz"),
     refusal("joint_service.state_rate_hz", 300.0, "300", "whole"),
     # timing
     refusal("joint_service.state_rate_hz", 501.0, "501", "500"),

@@ -152,7 +152,7 @@ def test_a_saved_setting_is_kept_by_its_drive_alone_and_only_a_value_of_its_kind
     settings.set(index, period, 8)
     settings.restore(index)
     assert (settings.get(index, period), settings.get(0, period)) == (7, 10)
-    with pytest.raises(DriveError, match=r"nearest is axis0\.controller\.config\.vel_limit"):
+    with pytest.raises(DriveError, match=r"did you mean axis0\.controller\.config\.vel_limit"):
         settings.get(index, "axis0.vel_limit")
     for name, value in ((period, 1.5), ("axis0.controller.config.vel_limit", math.nan)):
         with pytest.raises(DriveError, match=r"int|float"):
@@ -271,8 +271,9 @@ def test_one_bus_for_all_six_is_refused_with_what_it_would_carry_and_that_is_acc
     with pytest.raises(ConfigError) as refused:
         load_changed(tmp_path, on_buses(*[RIGHT] * 6))
     assert str(refused.value).partition("can.hip_right: ")[2] == (
-        "6 modules at 500 Hz would load it to 150% of 1 Mbit/s (177% while gains blend); at most "
-        "85% (98%): 3 modules on a bus at this rate, or a lower joint_service.rate_hz"
+        "6 modules at 500 Hz would load the bus to 150% of 1 Mbit/s (177% while gains blend); must "
+        "be at most 85% (98%): connect at most 3 modules to a bus at this rate, or lower "
+        "joint_service.rate_hz"
     )
 
     def change(raw: Table) -> None:

@@ -102,13 +102,13 @@ def test_what_is_absent_is_told_with_its_extra_and_what_brings_it(
     with pytest.raises(MissingPackageError) as found:
         require("sim")
     install = ROOT / "deploy" / "install"
-    assert str(found.value) == f"mujoco is not installed; the extra `sim` brings it: {install}"
+    assert str(found.value) == f"mujoco is not installed; the extra `sim` includes it: {install}"
     monkeypatch.setitem(sys.modules, "odrive", None)
     with pytest.raises(MissingPackageError, match=r"deploy/install --runtime usb$"):
         require("usb")
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(
-        MissingPackageError, match=r"^mujoco and PIL are not .* brings them: .*; or"
+        MissingPackageError, match=r"^mujoco and PIL are not .* includes them: .*; or"
     ):
         require("sim", "look at a record")
 
@@ -145,8 +145,8 @@ def test_a_package_that_cannot_be_imported_says_why_in_one_line_and_its_extra(
     (tmp_path / "rosbags" / "__init__.py").write_text(code, encoding="utf-8")
     for name in [name for name in sys.modules if name.split(".")[0] == "rosbags"]:
         monkeypatch.delitem(sys.modules, name)
-    brings = f"the extra `ros2` brings it: {ROOT}/deploy/install --runtime ros2$"
-    pattern = f"^rosbags is installed and cannot be imported: {said}; {brings}"
+    brings = f"the extra `ros2` includes it: {ROOT}/deploy/install --runtime ros2$"
+    pattern = f"^rosbags is installed but cannot be imported: {said}; {brings}"
     with pytest.raises(MissingPackageError, match=pattern):
         require("ros2")
     with pytest.raises(MissingPackageError, match=pattern):

@@ -173,5 +173,5 @@ def test_a_home_is_filled_in_or_the_path_refused(monkeypatch: pytest.MonkeyPatch
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.setattr(Path, "expanduser", unknown)
-    with pytest.raises(XrlError, match=r"~/x: .* set HOME, or write a whole path"):
+    with pytest.raises(XrlError, match=r"~/x: .* set HOME, or use an absolute path"):
         in_home("~/x")

@@ -86,26 +86,26 @@ def spoiled_bounds(spoil: Callable[[dict[str, Any]], object]) -> bytes:
 
 NODES = [[[1.0] * 6] * 2] * 2
 CORRUPT = {
-    "empty": (b"", "(file)", "is no gain schedule"),
+    "empty": (b"", "(file)", "is not a gain schedule"),
     "cut off": (SHIPPED[:2000], "(file)", "truncated"),
     "five joints": (spoiled(D=[[[1.0] * 5] * 6] * 25), "(file)", "length 6"),
-    "not a number": (spoiled(z=[float("nan"), 1.0]), "(file)", "is no gain schedule"),
-    "falling heights": (spoiled(z=[0.9, 0.8], pitch=[0.0, 1.0], D=NODES), "z", "do not rise"),
-    "one height": (spoiled(z=[0.9], pitch=[0.0, 1.0], D=NODES[:1]), "z", "do not rise"),
-    "a row too few": (spoiled(z=[0.8, 0.9], pitch=[0.0, 1.0], D=NODES[:1]), "D", "does not fit"),
+    "not a number": (spoiled(z=[float("nan"), 1.0]), "(file)", "is not a gain schedule"),
+    "falling heights": (spoiled(z=[0.9, 0.8], pitch=[0.0, 1.0], D=NODES), "z", "do not increase"),
+    "one height": (spoiled(z=[0.9], pitch=[0.0, 1.0], D=NODES[:1]), "z", "do not increase"),
+    "a row too few": (spoiled(z=[0.8, 0.9], pitch=[0.0, 1.0], D=NODES[:1]), "D", "does not match"),
     "a row too short": (
-        spoiled(z=[0.8, 0.9], pitch=[0.0, 1.0], D=[NODES[0], NODES[0][:1]]), "D", "does not fit",
+        spoiled(z=[0.8, 0.9], pitch=[0.0, 1.0], D=[NODES[0], NODES[0][:1]]), "D", "does not match",
     ),
-    "no rows": (spoiled(D=[]), "D", "does not fit"),
+    "no rows": (spoiled(D=[]), "D", "does not match"),
     # its digest is that of its inputs: nothing later would name the file
     "negative gains": (spoiled(D=[[[-5.0] * 6] * 6] * 25), "D[0][0][0]", "-5.0"),
     "gains that no joint service takes": (spoiled(D=[[[1e9] * 6] * 6] * 25), "D[0][0][0]", "0000"),
     "a kind without bounds": (spoiled_bounds(lambda b: b.pop("knee")), "bounds", "are for ankle"),
     "bounds without a part": (
-        spoiled_bounds(lambda b: b["hip"].update(theta=[1.0, 1.0])), "bounds.hip", "no parts",
+        spoiled_bounds(lambda b: b["hip"].update(theta=[1.0, 1.0])), "bounds.hip", "is empty",
     ),
     "bounds of no torque": (
-        spoiled_bounds(lambda b: b["ankle"].update(tau_ff=[])), "bounds.ankle", "no parts",
+        spoiled_bounds(lambda b: b["ankle"].update(tau_ff=[])), "bounds.ankle", "is empty",
     ),
     "a folder": (None, "(file)", "cannot be read"),
 }  # fmt: skip
@@ -164,7 +164,7 @@ def test_a_schedule_of_other_inputs_or_another_version_is_stale(
     other = changed(robot, mass={"payload": 5.0})
     forged = msgspec.structs.replace(schedule, inputs=inputs_of(other))
     other = msgspec.structs.replace(other, gain_schedule=forged)
-    assert gain_schedule.why_stale(other) == "the gain schedule's digest is not that of its inputs"
+    assert gain_schedule.why_stale(other) == "the gain schedule's digest does not match its inputs"
     older = msgspec.structs.replace(schedule, version=gain_schedule.VERSION + 1)
     other = msgspec.structs.replace(robot, gain_schedule=older)
     assert "version 3, not 2" in gain_schedule.why_stale(other)
@@ -177,7 +177,7 @@ def test_only_the_certified_split_requires_a_schedule_and_that_with_bounds(
     with pytest.raises(ConfigError) as caught:
         gain_schedule.require(bare, Path("lab.toml"))
     assert str(caught.value) == (
-        "lab.gains.json: (file): there is no gain schedule; run `xrl gains --config lab.toml`"
+        "lab.gains.json: (file): the gain schedule is missing; run `xrl gains --config lab.toml`"
     )
     gain_schedule.require(changed(bare, law={"split": "diagonal"}), Path("lab.toml"))
     # One by an older `xrl gains`: its joint services would believe anything.

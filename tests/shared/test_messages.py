@@ -187,7 +187,7 @@ def test_a_placeholder_is_filled_in_once_whatever_it_is_filled_with() -> None:
 def test_braces_that_nothing_is_filled_into_are_found_and_refused(text: str, stray: str) -> None:
     assert stray_braces(text, ["{run}"]) == stray
     if stray:
-        with pytest.raises(BusError, match=r"is no placeholder; only \{run\} is filled in"):
+        with pytest.raises(BusError, match=r"is not a valid placeholder; only \{run\} is replaced"):
             expand(text, Path("/tmp"))
 
 

@@ -144,7 +144,7 @@ def test_a_link_is_not_followed_and_a_way_over_one_is_refused(tmp_path: Path) ->
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
     (tmp_path / "open" / "link").symlink_to(tmp_path / "mine")
-    with pytest.raises(FleetError, match="others may write to"):
+    with pytest.raises(FleetError, match="other users can write to"):
         check_own(tmp_path / "open" / "link" / "run")
 
 
@@ -154,7 +154,9 @@ def test_a_directory_that_others_could_replace_is_refused(there: bool, tmp_path:
     run_dir = open_to_all / "below" / "run"
     (run_dir if there else open_to_all).mkdir(parents=True)
     open_to_all.chmod(0o777)
-    with pytest.raises(FleetError, match=r"others may write to .*/open and replace it; `chmod"):
+    with pytest.raises(
+        FleetError, match=r"other users can write to .*/open and replace it; run `chmod"
+    ):
         check_own(run_dir)
     check_own(run_dir, alone=False)  # it can still be stopped
     open_to_all.chmod(0o1777)
@@ -167,7 +169,7 @@ def test_a_service_by_hand_is_refused_there_and_a_successor_is_not(
     """A module whose service crashed is to be held, whatever has become of the directory."""
     tmp_path.chmod(0o777)
     monkeypatch.delenv(FLEET_VARIABLE, raising=False)
-    with pytest.raises(argparse.ArgumentTypeError, match="others may write to it"):
+    with pytest.raises(argparse.ArgumentTypeError, match="other users can write to it"):
         service_directory(str(tmp_path))
     monkeypatch.setenv(FLEET_VARIABLE, str(tmp_path))
     assert service_directory(str(tmp_path)) == tmp_path
@@ -203,7 +205,7 @@ def test_without_a_folder_in_memory_the_live_directory_is_the_run_directory(
 def test_a_live_directory_that_others_may_write_to_is_refused(tmp_path: Path, mode: int) -> None:
     live = make_live_dir(tmp_path)
     live.chmod(mode)
-    with pytest.raises(FleetError, match=rf"{live}: others may write to it"):
+    with pytest.raises(FleetError, match=rf"{live}: other users can write to it"):
         check_own(tmp_path)
     check_own(tmp_path, alone=False)
 

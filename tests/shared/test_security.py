@@ -323,7 +323,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
     "no folder": (shutil.rmtree, "no keys for `mtls` here"),
     "no names": (_remove("names.toml"), "names.toml is missing"),
     "another robot's": (_rename, "keys of robot 'somebody'"),
-    "an unknown name": (_unknown, "generations.cook: no such name"),
+    "an unknown name": (_unknown, "generations.cook: not a valid name"),
     "no names in it": (lambda keys: (keys / "names.toml").write_text("x ="), "names.toml"),
     "no certificate": (_remove("planner.pem"), "planner.pem: missing"),
     "no key": (_remove("planner.key"), "planner.key: missing"),
@@ -365,18 +365,18 @@ def secured(endpoint: str | None = None, **changes: object) -> RobotConfig:
     return msgspec.structs.replace(ROBOT, bus=bus)
 
 
-NO_ADDRESS = "an IP address, without a port"
+NO_ADDRESS = "an IP address without a port"
 
 
 @pytest.mark.parametrize(
     ("robot", "words"),
     [
-        (secured("tcp/127.0.0.1:7447"), 'mode = "open", and anyone'),
+        (secured("tcp/127.0.0.1:7447"), 'mode = "open": anyone'),
         (secured("tls/10.0.0.1:7447"), 'mode = "mtls"'),
         (secured("tcp/10.0.0.1:7447", mode="mtls"), "tls/"),
         (secured("unixsock-stream/{run}/planner.zenoh", mode="mtls"), 'mode = "local"'),
         (secured("tls/10.0.0.1:7447", mode="open"), 'mode = "mtls"'),
-        (secured(keys="keys"), "begins with / or ~"),
+        (secured(keys="keys"), "must start with / or ~"),
         *((secured(allow=(text,)), NO_ADDRESS)
           for text in ("laptop.local", "10.0.0.1:22", "", "10.0.0.0/8")),
     ],
@@ -487,21 +487,22 @@ def pair(robot: RobotConfig, short_dir: Path) -> Pair:
     return Pair(own, authority, short_dir)
 
 
-OUR_TIME = "by its clock our certificate has expired, or is not valid yet"
+OUR_TIME = "by its clock, our certificate has expired or is not valid yet"
 FAULTS: dict[str, tuple[Callable[[Pair], None], str]] = {
     "none": (lambda _: None, ""),
     "its clock, or ours": (
         lambda p: p.replace("knee_left", from_day=10),
-        "its certificate is not valid yet, by this host's clock (20",
+        "its certificate is not valid yet (this host's clock: 20",
     ),
     "its certificate is old": (
         lambda p: p.replace("knee_left", from_day=-40, days=20),
-        "its certificate has expired, by this host's clock",
+        "its certificate has expired (this host's clock",
     ),
     "its authority": (
-        lambda p: p.replace("knee_left", foreign=True), "its certificate is of another authority",
+        lambda p: p.replace("knee_left", foreign=True),
+        "its certificate was signed by another authority",
     ),
-    "its host": (lambda p: p.replace("knee_left", host="10.1.1.1"), "is another host's"),
+    "its host": (lambda p: p.replace("knee_left", host="10.1.1.1"), "belongs to another host"),
     "our certificate is old": (lambda p: p.replace("planner", from_day=-40, days=20), OUR_TIME),
     "our clock, or its": (lambda p: p.replace("planner", from_day=10), OUR_TIME),
     "our authority": (lambda p: p.replace("planner", foreign=True), "our certificate"),
@@ -523,9 +524,9 @@ def test_why_a_link_does_not_come_is_told_truly(pair: Pair, fault: str) -> None:
     ("when", "words"),
     [
         ({}, ""),
-        ({"from_day": 10}, "is not valid yet, by this host's clock"),
+        ({"from_day": 10}, "is not valid yet (this host's clock"),
         ({"from_day": -40, "days": 20}, "has expired"),
-        ({"foreign": True}, "is of another authority"),
+        ({"foreign": True}, "was signed by another authority"),
     ],
 )
 def test_a_certificate_that_this_host_does_not_believe_is_told(

@@ -33,11 +33,11 @@ def asked(**fields: object) -> HandLead:
 @given(st.lists(st.tuples(NUMBER, NUMBER), min_size=1, max_size=20))
 def test_it_never_jumps_and_never_leaves_its_limits(places: list[tuple[float, float]]) -> None:
     hand = LedHand()
-    hand.ask(asked(height=NOW.height, pitch=NOW.pitch), NOW)
+    hand.request(asked(height=NOW.height, pitch=NOW.pitch), NOW)
     before = hand.over(NOW)
     assert before[:4] == NOW[:4], "it begins where the hand is"
     for height, pitch in places:
-        hand.ask(asked(height=height, pitch=pitch), NOW)
+        hand.request(asked(height=height, pitch=pitch), NOW)
         for _ in range(20):
             hand.advance(DT)
             now = hand.over(NOW)
@@ -53,13 +53,13 @@ def test_it_never_jumps_and_never_leaves_its_limits(places: list[tuple[float, fl
 
 def test_a_hand_stays_where_it_was_led_and_its_push_expires() -> None:
     hand = LedHand()
-    hand.ask(asked(height=0.95, pitch=0.3), NOW)
+    hand.request(asked(height=0.95, pitch=0.3), NOW)
     for _ in range(5000):
         hand.advance(DT)
     assert hand.over(NOW).height == pytest.approx(0.95, abs=1e-4)
     assert hand.over(NOW).pitch == pytest.approx(0.3, abs=1e-4)
     hand = LedHand()
-    hand.ask(asked(leads=False, push=(0.0, 1e6, -3.0)), NOW)
+    hand.request(asked(leads=False, push=(0.0, 1e6, -3.0)), NOW)
     assert hand.push == (0.0, hands.PUSH_MAX, -3.0)
     assert hand.over(NOW) == NOW
     for _ in range(math.ceil(hands.PUSH_EXPIRES_S / DT) + 1):
@@ -71,10 +71,10 @@ def test_a_hand_stays_where_it_was_led_and_its_push_expires() -> None:
 @pytest.mark.parametrize("field", ["height", "pitch", "push"])
 def test_what_is_no_number_is_ignored(field: str, wrong: float) -> None:
     hand = LedHand()
-    hand.ask(asked(height=1.0, pitch=0.0, push=(1.0, 0.0, 0.0)), NOW)
+    hand.request(asked(height=1.0, pitch=0.0, push=(1.0, 0.0, 0.0)), NOW)
     before = hand.numbers()
     given = (wrong, 0.0, 0.0) if field == "push" else wrong
-    hand.ask(asked(**{"height": 0.9, "pitch": 0.5, field: given}), NOW)
+    hand.request(asked(**{"height": 0.9, "pitch": 0.5, field: given}), NOW)
     assert hand.numbers() == before
 
 

@@ -55,7 +55,7 @@ def wait_and_type(run_dir: Path, typed: bytes) -> None:
             try:
                 assert waiting.stdout is not None
                 told = iter(waiting.stdout.readline, "")
-                assert any("all six heard" in line for line in told)
+                assert any("all six modules respond" in line for line in told)
                 os.write(person, typed)
                 assert waiting.wait(timeout=40.0) == 0
             finally:

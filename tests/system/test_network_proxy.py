@@ -236,6 +236,6 @@ def test_an_action_is_published_on_the_bus_and_shown_by_the_verb(
     assert cli.main(["inject", "--list", *words]) == 0
     assert "loss=50%" in capsys.readouterr().out
     assert cli.main(["inject", "--clear", "all", *words]) == 0
-    assert "nothing is done" in capsys.readouterr().out
+    assert "no link is impaired" in capsys.readouterr().out
     rig.wait(lambda: len(rig.told) == 12)
     assert [event.active for event in rig.told] == [True] * 6 + [False] * 6

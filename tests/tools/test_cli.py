@@ -56,18 +56,18 @@ def test_help_is_a_screen_that_lists_every_verb_or_its_noun_and_imports_none() -
 @pytest.mark.parametrize(
     ("words", "usage", "hint"),
     [
-        ("down --li", "xrl down", "no flag '--li'; did you mean --limp? "),
-        ("demo --kil planner@3", "xrl demo", "no flag '--kil'; did you mean --kill? "),
-        ("demo --kil=planner@3", "xrl demo", "no flag '--kil'; did you mean --kill? "),
+        ("down --li", "xrl down", "unknown flag '--li'; did you mean --limp? "),
+        ("demo --kil planner@3", "xrl demo", "unknown flag '--kil'; did you mean --kill? "),
+        ("demo --kil=planner@3", "xrl demo", "unknown flag '--kil'; did you mean --kill? "),
         (
             "drive tare -reun-dir=x",
             "xrl drive tare",
-            "no flag '-reun-dir'; did you mean --run-dir? ",
+            "unknown flag '-reun-dir'; did you mean --run-dir? ",
         ),
-        ("sim --nosuch", "xrl sim", "no flag '--nosuch'; `--help`"),
-        ("drive --nosuch jog", "xrl drive", "no flag '--nosuch'; `--help`"),
-        ("--nosuch sim", "xrl", "no flag '--nosuch'; `--help`"),
-        ("status more", "xrl status", "unexpected: more"),
+        ("sim --nosuch", "xrl sim", "unknown flag '--nosuch'; `--help`"),
+        ("drive --nosuch jog", "xrl drive", "unknown flag '--nosuch'; `--help`"),
+        ("--nosuch sim", "xrl", "unknown flag '--nosuch'; `--help`"),
+        ("status more", "xrl status", "unexpected argument: more"),
     ],
 )
 def test_a_shortened_or_unknown_flag_is_refused_with_its_verbs_usage_and_the_closest_flag(
@@ -218,13 +218,13 @@ def test_a_folder_that_is_gone_or_is_none_is_one_line(
     monkeypatch.setenv("XRL_RUN_DIR", str(tmp_path / "file"))
     for verb in ("down", "status"):
         assert cli.main([verb]) == 2
-        assert capsys.readouterr().err.endswith("is no directory; give another --run-dir\n")
+        assert capsys.readouterr().err.endswith("is not a directory; give another --run-dir\n")
     gone = tmp_path / "gone"
     gone.mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
     assert cli.main(["up", "--run-dir", "run"]) == 2
-    assert "the folder in which this was started has been removed" in capsys.readouterr().err
+    assert "the working directory was removed" in capsys.readouterr().err
 
 
 def test_workers_without_shared_memory_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,7 +232,7 @@ def test_workers_without_shared_memory_are_told(monkeypatch: pytest.MonkeyPatch)
         raise OSError(errno.ENOENT, "No such file or directory")
 
     monkeypatch.setattr("joblib.Parallel.__call__", no_locks)
-    with pytest.raises(RunError, match=r"no worker process can be started: .*/dev/shm"):
+    with pytest.raises(RunError, match=r"cannot start worker processes: .*/dev/shm"):
         list(pool.results(str, [1, 2], 2, str))
 
 
@@ -246,7 +246,7 @@ def test_a_bug_is_a_traceback_and_neither_a_fall_nor_bad_input(
     assert cli.main(["faults"]) == BUG_EXIT_CODE
     told = capsys.readouterr().err
     assert "AttributeError" in told
-    assert told.endswith("xrl: a fault of xrl itself: please report the lines above\n")
+    assert told.endswith("xrl: this is a bug in xrl; please report the lines above\n")
 
 
 @pytest.mark.parametrize(

@@ -81,12 +81,12 @@ def test_each_kind_of_field_is_read() -> None:
 @pytest.mark.parametrize(
     ("words", "right"),
     [
-        ("--delay -1", "a number from 0 to 1000 ms is right"),
-        ("--delay nan", "a number from 0 to 1000 ms is right"),
-        ("--delay 1_0", "a number from 0 to 1000 ms is right"),
-        ("--for -0.1", "a number of at least 0 s is right"),
-        ("--seed 1.5", "a whole number from 0 to 9 is right"),
-        ("--seed 10", "a whole number from 0 to 9 is right"),
+        ("--delay -1", "must be a number from 0 to 1000 ms"),
+        ("--delay nan", "must be a number from 0 to 1000 ms"),
+        ("--delay 1_0", "must be a number from 0 to 1000 ms"),
+        ("--for -0.1", "must be a number of at least 0 s"),
+        ("--seed 1.5", "must be a whole number from 0 to 9"),
+        ("--seed 10", "must be a whole number from 0 to 9"),
         ("--mode x", "invalid choice: 'x'"),
         ("--push 1", "'1': letters are right"),
         ("--loud --quiet", "not allowed with"),
@@ -110,7 +110,7 @@ def test_no_number_of_any_verb_takes_what_is_none_or_beyond_its_range(verb: Verb
         low, high = (field.kind(end) for end in (field.limits.low, field.limits.high))
         beyond = (low - 1 - abs(low), high + 1 + abs(high), 1.5 if field.kind is int else "1_0")
         for bad in ("nan", "inf", "-inf", "1e300", "one", "", *beyond):
-            with pytest.raises(argparse.ArgumentTypeError, match="is right"):
+            with pytest.raises(argparse.ArgumentTypeError, match="must be"):
                 _argument(field)["type"](str(bad))
 
 

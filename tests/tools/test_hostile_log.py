@@ -110,5 +110,5 @@ def test_metadata_that_is_computed_with_is_checked(
 @pytest.mark.parametrize("value", ["fast", "nan", "0", "1e400"])
 def test_a_pace_that_is_none_is_told(value: str, tmp_path: Path) -> None:
     log = read_run(Path(made_up(tmp_path / "run.mcap", {"run": {"pace": value}}, most=1)))
-    with pytest.raises(RunError, match=f"run.pace is {value!r}; above 0"):
+    with pytest.raises(RunError, match=f"run.pace is {value!r}; it must be above 0"):
         verdict._pace(log)

@@ -49,7 +49,7 @@ def test_a_verb_names_the_extra_that_it_lacks(
     assert cli.main(shlex.split(words.replace("OUT", str(tmp_path / "run.mcap")))) == 2
     output, errors = capsys.readouterr()
     assert errors.count("\n") == 1
-    assert f"the extra `{extra}` brings " in errors
+    assert f"the extra `{extra}` includes " in errors
     assert output == ""
     assert list(tmp_path.iterdir()) == []
 
@@ -69,8 +69,8 @@ def test_a_verb_whose_package_cannot_be_imported_gives_the_packages_remedy_in_on
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(
-        "xrl: mujoco is installed and cannot be imported: mujoco-core is missing. "
-        "pip install --force-reinstall mujoco; the extra `sim` brings it: "
+        "xrl: mujoco is installed but cannot be imported: mujoco-core is missing. "
+        "pip install --force-reinstall mujoco; the extra `sim` includes it: "
     )
     assert done.stderr.count("\n") == 1
     assert [file.name for file in tmp_path.iterdir()] == ["mujoco"]
@@ -86,4 +86,4 @@ def test_doctor_tells_in_a_row_that_no_settings_are_read_without_the_package_for
     monkeypatch.setitem(sys.modules, "odrive", None)
     (row,) = doctor._Usb(robot, {}, services_up=False).rows(tmp_path)
     assert row.found == "odrive is not installed"
-    assert row.fix.startswith("the extra `usb` brings it: ")
+    assert row.fix.startswith("the extra `usb` includes it: ")

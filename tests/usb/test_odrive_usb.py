@@ -209,7 +209,7 @@ def test_no_reading_after_arm_reports_the_error_before(
 def test_a_position_that_is_no_count_is_refused_and_the_drive_stays(
     control: Control, drive: OdriveUsb, bad: float
 ) -> None:
-    with pytest.raises(DriveError, match="are no positions"):
+    with pytest.raises(DriveError, match="are not valid positions"):
         control.drive.set_position((bad, 0.0))
     control.drive.set_position((1.0, 1.0))
     assert eventually(lambda: control.pos == (1.0, 1.0))

@@ -1,4 +1,4 @@
-"""An ODrive as bring-up sees it: settings by name, backed up, compared, written, read back."""
+"""Settings of ODrives for bring-up: backed up, compared, written and read back by name."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from shared.exceptions import DriveError
 from shared.toml_file import read_text
 
 Value = bool | int | float | str | None
-"""A value of any endpoint; text: the name of another endpoint, or none at all."""
+"""Value of an endpoint; text is the name of another endpoint, None refers to no endpoint."""
 
 FIRMWARE: Final = (0, 5, 6)
 """Firmware that the settings' names and the drivers are made for."""
 OLDEST: Final = (0, 5, 4)
-"""Before it, the CAN settings, the board's error register and the heartbeat are other ones."""
+"""Oldest supported firmware; earlier, CAN settings, board errors and heartbeat are different."""
 
 AXIS_ERRORS: Final[dict[str, type[IntFlag]]] = {
     "error": AxisError, "motor.error": MotorError, "encoder.error": EncoderError,
@@ -50,18 +50,18 @@ STATUS: Final = (
     "brake_resistor_armed",
     *(f"{axis}.{name}" for axis in AXES for name in _AXIS_STATUS),
 )
-"""A board's state, besides its settings."""
+"""Endpoints of a board's state."""
 
 ABSOLUTE: Final = 0x100
 """Bit of `encoder.config.mode`: an absolute encoder."""
 DIRECTION: Final = "encoder.config.direction"
 _NOT_JSON: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
-"""Numbers that JSON does not have, as they stand in the file."""
+"""Numbers that JSON does not have, by their text in the file."""
 
-CALIBRATE: Final = "hang the leg, `xrl drive configure --apply --calibrate`"
+CALIBRATE: Final = "hang the leg and run `xrl drive configure --apply --calibrate`"
 _CALIBRATED = {"motor.config.pre_calibrated": "motor.is_calibrated",
                "encoder.config.pre_calibrated": "encoder.is_ready"}  # fmt: skip
-"""Settings that a drive takes only once it is calibrated."""
+"""Settings that a drive accepts only once it is calibrated, and the endpoints that show this."""
 _FOUND = (DIRECTION, "encoder.config.phase_offset", "encoder.config.phase_offset_float")
 """Results of the encoder's calibration with the present wiring. With other values the motor has no
 torque, or runs away.
@@ -69,10 +69,10 @@ torque, or runs away.
 
 
 class Board(Protocol):
-    """One ODrive. Every method may take seconds, and fails with one clear sentence.
+    """One ODrive. Every method may take seconds.
 
     Raises:
-        DriveError: from every method: the board does not answer any more, or not in time.
+        DriveError: from every method: the board does not answer, or not in time.
     """
 
     @property
@@ -81,14 +81,14 @@ class Board(Protocol):
 
     @property
     def firmware(self) -> tuple[int, int, int]:
-        """As 0, 5, 6."""
+        """Version, such as (0, 5, 6)."""
 
     @property
     def settings(self) -> tuple[str, ...]:
         """Names of all settings that this board saves."""
 
     def read(self, names: Iterable[str]) -> dict[str, Value]:
-        """Return the values of these endpoints; those that the board does not have are left out."""
+        """Return the values of these endpoints, without those that the board lacks."""
 
     def write(self, values: Mapping[str, Value]) -> None:
         """Write these endpoints in order; they are lost at the next restart unless saved."""
@@ -110,14 +110,14 @@ class FoundBoards(NamedTuple):
     """The boards on one way of access."""
 
     boards: dict[str, Board]
-    """By serial number; the requested ones that answered."""
+    """Requested boards that answered, by serial number."""
     troubles: dict[str, str]
-    """By serial number: why a requested one is missing."""
+    """Why a requested board is missing, by serial number."""
     strangers: tuple[str, ...]
     """Serial numbers found that were not requested."""
 
     def in_no_module(self, robot: RobotConfig) -> str:
-        """Return what to say of the strangers that are no module's of the robot; "": none is."""
+        """Return a note about strangers that are in no module of the robot, or ""."""
         known = {module.serial_number.upper() for module in robot.module}
         strangers = ", ".join(serial for serial in self.strangers if serial not in known)
         return f"; plugged in and in no [[module]]: {strangers}" if strangers else ""
@@ -135,7 +135,7 @@ def equal(one: Value, other: Value) -> bool:
 
 
 def is_known(firmware: tuple[int, int, int]) -> bool:
-    """Return True for a firmware whose settings have the names that are used here."""
+    """Return True if the settings of a firmware have the names used here."""
     return firmware >= OLDEST and firmware[:2] == FIRMWARE[:2]
 
 
@@ -148,7 +148,7 @@ def number(values: Mapping[str, Value], name: str) -> float:
     """Return a value that must be a number."""
     value = values.get(name)
     if not isinstance(value, int | float):
-        raise DriveError(f"no number at {name}; is this an ODrive v3 with firmware 0.5.x?")
+        raise DriveError(f"no number at {name}; it must be an ODrive v3 with firmware 0.5.x")
     return value
 
 
@@ -163,16 +163,16 @@ class BoardBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Backup(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The file."""
+    """Backup file."""
 
     time: str
-    """When it was made, ISO 8601, local time with its offset."""
+    """Time of the backup, ISO 8601, local time with its offset."""
     robot_file: str
     boards: tuple[BoardBackup, ...]
 
 
 def backup_of(module: str, board: Board) -> BoardBackup:
-    """Return a board's backup, with its numbers as JSON can have them."""
+    """Return a board's backup, with numbers in a form that JSON allows."""
     plain = {
         name: str(value) if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in board.read(board.settings).items()
@@ -181,7 +181,7 @@ def backup_of(module: str, board: Board) -> BoardBackup:
 
 
 def settings_of(backup: BoardBackup) -> dict[str, Value]:
-    """Return a backup's settings with their numbers as they were."""
+    """Return a backup's settings with the original numbers."""
     return {
         name: _NOT_JSON.get(value, value) if isinstance(value, str) else value
         for name, value in backup.settings.items()
@@ -189,7 +189,7 @@ def settings_of(backup: BoardBackup) -> dict[str, Value]:
 
 
 def write_backup(path: Path, boards: Sequence[BoardBackup], *, time: str, robot_file: str) -> None:
-    """Write a backup; the file is whole or not there, and none is ever overwritten."""
+    """Write a backup atomically; an existing file is never overwritten."""
     backup = Backup(time=time, robot_file=robot_file, boards=tuple(boards))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -208,26 +208,26 @@ def read_backup(path: Path) -> Backup:
     except OSError as error:
         raise DriveError(f"{path}: cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, UnicodeError) as error:
-        raise DriveError(f"{path}: not a backup of `xrl drive configure`: {error}") from None
+        raise DriveError(f"{path}: not a backup from `xrl drive configure`: {error}") from None
 
 
 class SettingChange(NamedTuple):
-    """One setting that is not as it should be."""
+    """One setting that differs from the wanted value."""
 
     module: str
     name: str
     before: Value
     after: Value
-    """As it should be written."""
+    """Value to write."""
     why: str
     inhibit: str
     """Why it cannot be written; "" if it can."""
     fits: Callable[[Value], bool]
-    """Returns True for a value that is as it should be."""
+    """Returns True if a value is as wanted."""
 
 
 class ChangeResult(NamedTuple):
-    """What came of a change."""
+    """Result of a change."""
 
     change: SettingChange
     now: Value
@@ -238,13 +238,13 @@ class ChangeResult(NamedTuple):
 def changes_to_wanted(
     module: str, wanted: Iterable[WantedSetting], board: Board
 ) -> list[SettingChange]:
-    """Return what of a board is not as the robot wants it."""
+    """Return the settings of a board that differ from the wanted ones."""
     settings = board.read(board.settings)
     calibrated = board.read([f"{axis}.{name}" for axis in AXES for name in _CALIBRATED.values()])
     changes = []
     for row in wanted:
         before, fits = settings.get(row.name), partial(_fits, row)
-        inhibit = "not there in this firmware; 0.5.6 has it"
+        inhibit = "missing in this firmware; 0.5.6 has it"
         if row.name in settings:
             inhibit = _uncalibrated(row.name, calibrated)
         if row.name not in settings or not fits(before):
@@ -255,29 +255,29 @@ def changes_to_wanted(
 
 
 def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> list[SettingChange]:
-    """Return what of a board is not as a backup has it."""
+    """Return the settings of a board that differ from a backup."""
     settings = board.read(board.settings)
     changes = []
     for name, value in saved.items():
         before, fits, inhibit = settings.get(name), partial(equal, value), ""
         if name not in settings:
-            inhibit = "not there in this board's firmware"
+            inhibit = "missing in this board's firmware"
         elif name.partition(".")[2] in _FOUND:
-            inhibit = "calibration finds it from the wiring of the phases; the board keeps its own"
+            inhibit = "calibration finds it for the wiring of the phases; the board keeps its own"
         if name not in settings or not fits(before):
             changes.append(SettingChange(module, name, before, value, "", inhibit, fits))
     return changes
 
 
 def refuse_armed(module: str, board: Board) -> None:
-    """Refuse a board one of whose axes is not idle: saving restarts it, and it lets go."""
+    """Raise DriveError if an axis of a board is not idle: saving restarts the board."""
     for axis, state in zip(AXES, board.states(), strict=True):
         if state != AxisState.IDLE:
             known = state in AxisState.__members__.values()
             words = AxisState(state).name if known else str(state)
             raise DriveError(
                 f"{module}.{axis} is in {words}, not idle: saving restarts the board, and the "
-                "module goes limp. Hang the robot; `xrl down`, or switch its supply off and on"
+                "module goes limp. Hang the robot and run `xrl down`, or cycle its supply"
             )
 
 
@@ -294,7 +294,7 @@ def write_changes(board: Board, changes: Sequence[SettingChange]) -> list[Change
 
 
 def _watchdog_order(change: SettingChange) -> float:
-    """Return a change's rank: a watchdog is off before its timeout changes, and on after that."""
+    """Return a change's rank: a watchdog is off before its timeout changes, and on afterwards."""
     if not change.name.endswith(".config.enable_watchdog"):
         return 0.0
     return 1.0 if change.after else -1.0
@@ -306,7 +306,7 @@ def describe_setting(value: Value) -> str:
 
 
 def difference_table(difference: Sequence[SettingChange]) -> Group:
-    """Return a difference for the terminal: a table, and below it why each is wanted."""
+    """Return a difference for the terminal: a table, and the reasons below it."""
     columns = (Column("module", no_wrap=True), Column("setting", no_wrap=True), "now", "new")
     rows = Table(*columns, title="difference", title_justify="left", box=box.SIMPLE_HEAD)
     reasons: dict[str, None] = {}
@@ -327,7 +327,7 @@ def _fits(row: WantedSetting, value: Value) -> bool:
 
 
 def _uncalibrated(name: str, calibrated: Mapping[str, Value]) -> str:
-    """Return why a setting cannot be written yet: the drive takes it only when calibrated."""
+    """Return why a setting cannot be written yet: the drive accepts it only once calibrated."""
     axis, _, below = name.partition(".")
     status = _CALIBRATED.get(below)
     if status is None or calibrated.get(f"{axis}.{status}"):

@@ -1,9 +1,9 @@
-"""Leads boards of a hanging robot through the calibrations of motors and encoders, and judges them.
+"""Calibrates the motors and encoders of a hanging robot's boards, and judges the results.
 
-A board is restarted before: errors are gone, and nothing has been connected. Its marks are written
-and saved once both axes are done. Whatever ends it before, another restart forgets what was
-measured: a calibration that fails or is broken off leaves halves that count as whole
-(docs/drives.md#traps).
+A board is restarted first, which clears its errors; no axis has been in closed loop since then. Its
+marks are written and saved once both axes are done. If the calibration ends early, another restart
+discards the measurements: a calibration that fails or is aborted leaves partial results that the
+board treats as complete (docs/drives.md#traps).
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from tools.bringup.motion_runner import NOT_IDLE, Interrupts
 from tools.terminal import Console, marked
 
 MOTOR_S: Final = 4.25
-"""Resistance 3 s, inductance 1.25 s."""
+"""Duration of the motor calibration, s: resistance 3 s, inductance 1.25 s."""
 LOCK_S: Final = 1.0
-"""Before the encoder's way out and back."""
+"""Time before the encoder's scan out and back, s."""
 CURRENT_MARGIN: Final = 8.0
-"""A beyond `current_lim` at which a drive disarms, as shipped."""
+"""Margin above `current_lim` at which a drive disarms, as shipped, A."""
 POLL_S: Final = 0.1
 OVERTIME_S: Final = 3.0
 IDLE_S: Final = 2.0
 STILL_S: Final = 0.5
 STILL_WAIT_S: Final = 20.0
 STILL_TURNS: Final = 0.02
-"""turns that a motor may move in `STILL_S` by itself."""
+"""Maximum motion of a still motor in `STILL_S`, turns."""
 SHARE_MIN: Final = 0.98
-"""A procedure that ends after less of its time was broken off."""
+"""A procedure that ends before this fraction of its duration was aborted."""
 POLES_WITHIN: Final = 0.04
-"""How near a response must be to that of another number of pole pairs to be put down to it."""
+"""Maximum relative deviation from the response of another number of pole pairs to name it."""
 
 _WATCHDOG: Final = "config.enable_watchdog"
 MARKS: Final = ("motor.config.pre_calibrated", "encoder.config.pre_calibrated")
@@ -61,36 +61,37 @@ _LOOK: Final = (
 )  # fmt: skip
 
 _STOPPED: Final = (
-    "the joint is blocked, at its stop or loaded: hang the leg, clear of the floor; then raise "
-    "motor.config.calibration_current (15 A turns a leg that 10 A do not)"
+    "the joint is blocked, at its stop or loaded: hang the leg clear of the floor; then raise "
+    "motor.config.calibration_current (15 A turns a leg that 10 A does not)"
 )
 ADVICE: Final[Mapping[tuple[str, IntFlag], str]] = {
     ("motor.error", MotorError.PHASE_RESISTANCE_OUT_OF_RANGE):
-        "look at the three phase wires: one is loose or broken. Else the motor has more ohms than "
-        "resistance_calib_max_voltage / calibration_current: less current, or more volts, at most "
-        "half the supply's",
+        "check the three phase wires: one is loose or broken. Else the motor's resistance exceeds "
+        "resistance_calib_max_voltage / calibration_current: lower the current, or raise the "
+        "voltage to at most half the supply's",
     ("motor.error", MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE):
-        "look at the three phase wires: two touch, or one is loose",
+        "check the three phase wires: two touch, or one is loose",
     ("motor.error", MotorError.UNBALANCED_PHASES):
-        "look at the three phase wires: one is loose",
+        "check the three phase wires: one is loose",
     ("motor.error", MotorError.CURRENT_LIMIT_VIOLATION):
-        "motor.config.calibration_current is more than current_lim and its margin, or a winding "
-        "has a short circuit",
+        "motor.config.calibration_current exceeds current_lim plus its margin, or a winding has a "
+        "short circuit",
     ("motor.error", MotorError.DRV_FAULT):
-        "a short circuit of the phases, or the board is broken: measure between the phases",
+        "the phases have a short circuit, or the board is broken: measure between the phases",
     ("motor.error", MotorError.MODULATION_MAGNITUDE):
-        "the supply has too few volts: resistance_calib_max_voltage is at most half of them",
+        "the supply voltage is too low: resistance_calib_max_voltage must be at most half of it",
     ("encoder.error", EncoderError.NO_RESPONSE):
-        f"the encoder counts nothing while the field turns: {_STOPPED}. If the shaft did turn: "
-        "the encoder's magnet or its plug",
+        f"the encoder does not count while the field turns: {_STOPPED}. If the shaft did turn, "
+        "check the encoder's magnet and plug",
     ("encoder.error", EncoderError.ABS_SPI_COM_FAIL):
-        "the encoder does not answer: its plug and wires, encoder.config.abs_spi_cs_gpio_pin, mode",
+        "the encoder does not answer: check its plug, wires, encoder.config.abs_spi_cs_gpio_pin "
+        "and mode",
 }  # fmt: skip
-"""By register and bit: what to look at."""
+"""Remedy by register and bit."""
 
 
 class Found(NamedTuple):
-    """What an axis's calibrations have found."""
+    """Results of an axis's calibrations."""
 
     resistance: float
     inductance: float
@@ -98,14 +99,14 @@ class Found(NamedTuple):
 
 
 class BoardResult(NamedTuple):
-    """What came of a board."""
+    """Result of calibrating a board."""
 
     found: dict[str, Found]
-    """By axis; saved only where nothing went wrong."""
+    """By axis; saved only if nothing went wrong."""
     why: str = ""
-    """What went wrong, and what to do; "" if nothing did."""
+    """Failure and remedy; "" if nothing went wrong."""
     not_idle: bool = False
-    """An axis does not say that it is idle."""
+    """True if an axis does not report that it is idle."""
 
 
 class Procedure(NamedTuple):
@@ -117,11 +118,11 @@ class Procedure(NamedTuple):
 
 
 Progress = Callable[[str, Procedure, float], None]
-"""Of the axis, what it is at, and for how many seconds."""
+"""Receives the axis, its procedure, and the seconds since the procedure began."""
 
 
 def uncalibrated(board: Board) -> tuple[str, ...]:
-    """Return the axes of a board that do not arm for want of a calibration."""
+    """Return the axes of a board that do not arm because they are not calibrated."""
     values = board.read([f"{axis}.{name}" for axis in AXES for name in _READY])
     return tuple(axis for axis in AXES if not all(values.get(f"{axis}.{n}") for n in _READY))
 
@@ -132,7 +133,7 @@ def procedures(board: Board, axis: str) -> tuple[Procedure, Procedure]:
     values = board.read(names)
     distance, rate = (number(values, name) for name in names)
     if not (distance > 0.0 and rate > 0.0):
-        raise DriveError(f"{axis}: {names[0]} and omega are {distance:g} and {rate:g}: not > 0")
+        raise DriveError(f"{axis}: {names[0]} and omega are {distance:g} and {rate:g}; must be > 0")
     scan_s = LOCK_S + 2.0 * distance / rate
     return (
         Procedure(AxisState.MOTOR_CALIBRATION, "motor", MOTOR_S),
@@ -141,7 +142,7 @@ def procedures(board: Board, axis: str) -> tuple[Procedure, Procedure]:
 
 
 def _scan_turns(values: Mapping[str, Value], axis: str) -> float:
-    """Return how many turns an encoder's calibration leads the motor out, and back."""
+    """Return the turns by which an encoder's calibration moves the motor out and back."""
     distance = number(values, f"{axis}.encoder.config.calib_scan_distance")
     poles = number(values, f"{axis}.motor.config.pole_pairs")
     return distance / (2.0 * math.pi * poles) if poles > 0.0 else math.inf
@@ -150,7 +151,7 @@ def _scan_turns(values: Mapping[str, Value], axis: str) -> float:
 def refuse_unfit(
     module: str, board: Board, axes: Sequence[str], pause: Callable[[float], None] = time.sleep
 ) -> None:
-    """Refuse a board that cannot be calibrated as it is set up, or whose joint moves."""
+    """Raise DriveError if a board's setup prevents its calibration, or its joint moves."""
     names = [f"{axis}.{name}" for axis in axes for name in _LOOK]
     levels = [f"config.dc_bus_{name}voltage_trip_level" for name in ("under", "over")]
     values = board.read([*names, *levels, "vbus_voltage"])
@@ -158,25 +159,25 @@ def refuse_unfit(
     volts = number(values, "vbus_voltage")
     faults = []
     if not low < volts < high:
-        faults.append(f"its supply has {volts:.1f} V, outside of {low:g} to {high:g} V")
+        faults.append(f"its supply is at {volts:.1f} V, outside of {low:g} to {high:g} V")
     for axis in axes:
         mode = int(number(values, f"{axis}.encoder.config.mode"))
         if not mode & ABSOLUTE:
             faults.append(
-                f"{axis}.encoder.config.mode is {mode}: no absolute encoder; 257 is right for AMS "
+                f"{axis}.encoder.config.mode is {mode}: not an absolute encoder; set 257 for AMS "
                 "over SPI (docs/bring-up.md, section 5)"
             )
         current = number(values, f"{axis}.motor.config.calibration_current")
         most = number(values, f"{axis}.motor.config.current_lim") + CURRENT_MARGIN
         if not 0.0 < current <= most:
             faults.append(
-                f"{axis}.motor.config.calibration_current is {current:g} A; more than 0, and with "
-                f"this current_lim at most {most:g} A are right"
+                f"{axis}.motor.config.calibration_current is {current:g} A; must be above 0 and, "
+                f"with this current_lim, at most {most:g} A"
             )
         if _scan_turns(values, axis) > 2.0:
             faults.append(
-                f"{axis} would be turned by {_scan_turns(values, axis):.1f} turns and back: are "
-                "motor.config.pole_pairs and encoder.config.calib_scan_distance right?"
+                f"{axis} would turn by {_scan_turns(values, axis):.1f} turns and back; check "
+                "motor.config.pole_pairs and encoder.config.calib_scan_distance"
             )
     if moves := _await_still(board, pause):
         faults.append(moves)
@@ -192,25 +193,25 @@ def calibrate_board(
     clock: Callable[[], float] = time.monotonic,
     pause: Callable[[float], None] = time.sleep,
 ) -> BoardResult:
-    """Calibrate axes of a board one after the other, mark and save them; or leave it as it was.
+    """Calibrate axes of a board in turn, mark and save them; on a failure leave it as it was.
 
     Args:
         board: idle; it restarts before and after.
         axes: "axis0", "axis1" or both.
-        interrupts: read all the time; one ends it, idles the axis and saves nothing.
-        progress: receives the axis, what it is at, and for how many seconds.
+        interrupts: polled; an interrupt ends the calibration, idles the axis and saves nothing.
+        progress: receives the axis, its procedure, and the seconds since the procedure began.
         clock: monotonic, s.
         pause: waits a number of seconds.
     """
     board.restart()
-    # a watchdog is fed over CAN only, and would end it
+    # a watchdog is fed over CAN only, and would end the calibration
     watchdogs = board.read([f"{axis}.{_WATCHDOG}" for axis in AXES])
     board.write(dict.fromkeys(watchdogs, False))
     board.clear_errors()
     found: dict[str, Found] = {}
     for axis in axes:
         for procedure in procedures(board, axis):
-            why = _await_still(board, pause)  # the axis before has let the leg swing
+            why = _await_still(board, pause)  # the previous axis has made the leg swing
             why = why or _run(board, axis, procedure, interrupts, progress, clock, pause)
             if why:
                 idle = _idle(board, axis, clock, pause)
@@ -224,12 +225,12 @@ def calibrate_board(
     lost = [axis for axis in uncalibrated(board) if axis in axes]
     after = board.read(list(marks))
     lost += [name for name in marks if after.get(name) is not True]
-    why = f"after the restart not calibrated: {', '.join(lost)}; once more" if lost else ""
+    why = f"not calibrated after the restart: {', '.join(lost)}; try again" if lost else ""
     return BoardResult(found, why)
 
 
 def _zeroed_angles(robot: RobotConfig, module: str, board: Board) -> Pair | None:
-    """Return where a board's joint is, (phi, theta), rad; None if it does not know."""
+    """Return the angles of a board's joint, (phi, theta), rad; None if it is unzeroed."""
     values = board.read([f"{axis}.encoder.pos_estimate" for axis in AXES])
     if len(values) < len(AXES):
         return None
@@ -248,7 +249,7 @@ def _run(
     clock: Callable[[], float],
     pause: Callable[[float], None],
 ) -> str:
-    """Run one calibration; return why it failed, "" if it did not."""
+    """Run one calibration; return why it failed, or ""."""
     begun_s = clock()
     progress(axis, procedure, 0.0)
     board.write({f"{axis}.requested_state": int(procedure.state)})
@@ -263,12 +264,13 @@ def _run(
             return _why_failed(board, axis, procedure, passed_s)
         if passed_s > procedure.seconds + OVERTIME_S:
             return (
-                f"it is in state {state} after {passed_s:.0f} s; {procedure.seconds:.0f} are right"
+                f"it is still in state {state} after {passed_s:.0f} s; it should take "
+                f"{procedure.seconds:.0f} s"
             )
 
 
 def _why_failed(board: Board, axis: str, procedure: Procedure, passed_s: float) -> str:
-    """Return why an axis that is idle again has failed its calibration; "" if it has not."""
+    """Return why an axis that is idle again has failed its calibration, or ""."""
     flag = _READY[0] if procedure.what == "motor" else _READY[1]
     names = [*(f"{axis}.{register}" for register in AXIS_ERRORS), f"{axis}.{flag}"]
     values = board.read(["error", *names])
@@ -286,26 +288,26 @@ def _why_failed(board: Board, axis: str, procedure: Procedure, passed_s: float) 
         return "; ".join([", ".join(errors), *advice])
     if passed_s < SHARE_MIN * procedure.seconds:
         return (
-            f"it ended after {passed_s:.1f} s, not after {procedure.seconds:.1f}, and without an "
-            "error: something else gives it orders"
+            f"it ended after {passed_s:.1f} s instead of {procedure.seconds:.1f} s, without an "
+            "error: another program commands it"
         )
-    return "" if values.get(f"{axis}.{flag}") else f"it ended without an error, and {flag} is False"
+    return "" if values.get(f"{axis}.{flag}") else f"it ended without an error, but {flag} is False"
 
 
 def _mismatch(board: Board, axis: str) -> str:
-    """Return how far the shaft has turned, whose pole pairs would fit, and what else it may be."""
+    """Return how far the shaft turned, the pole pairs that would fit, and other causes."""
     name = f"{axis}.encoder.calib_scan_response"
     values = board.read([name, *(f"{axis}.{each}" for each in _LOOK)])
     if not values.get(name):
         return _STOPPED
     turned = number(values, name) / number(values, f"{axis}.encoder.config.cpr")
     expected, poles = _scan_turns(values, axis), number(values, f"{axis}.motor.config.pole_pairs")
-    words = f"its encoder counted {turned:.3f} turns where {expected:.3f} are right"
+    words = f"its encoder counted {turned:.3f} turns instead of {expected:.3f}"
     other = round(expected * poles / turned)
     if other not in (0, poles) and abs(turned * other / (expected * poles) - 1.0) < POLES_WITHIN:
-        words += f", as those of a motor with {other} pole pairs"
+        words += f", as with a motor of {other} pole pairs"
     if turned > expected:
-        return f"{words}: is motor.config.pole_pairs or encoder.config.cpr wrong?"
+        return f"{words}: check motor.config.pole_pairs and encoder.config.cpr"
     return f"{words}: {_STOPPED}. Else motor.config.pole_pairs or encoder.config.cpr is wrong"
 
 
@@ -320,7 +322,7 @@ def _found(board: Board, axis: str) -> Found:
 def _idle(
     board: Board, axis: str, clock: Callable[[], float], pause: Callable[[float], None]
 ) -> bool:
-    """Ask an axis for idle; return False if it does not say that it is."""
+    """Idle an axis; return False if it does not report that it is idle."""
     until_s = clock() + IDLE_S
     board.write({f"{axis}.requested_state": int(AxisState.IDLE)})
     while board.states()[AXES.index(axis)] != AxisState.IDLE:
@@ -331,7 +333,7 @@ def _idle(
 
 
 def _await_still(board: Board, pause: Callable[[float], None]) -> str:
-    """Wait until a board's motors stand; return how they move if they do not."""
+    """Wait until a board's motors are still; return how they move if they are not, else ""."""
     names = [f"{axis}.encoder.pos_estimate" for axis in AXES]
     moved = math.inf
     for _ in range(round(STILL_WAIT_S / STILL_S)):
@@ -342,11 +344,11 @@ def _await_still(board: Board, pause: Callable[[float], None]) -> str:
             moved = max(moved, *(abs(number(now, n) - number(first, n)) for n in names))
         if moved <= STILL_TURNS:
             return ""
-    return f"its motors move by themselves, {moved:.2f} turns in {STILL_S:g} s: hold it still"
+    return f"its motors move on their own, {moved:.2f} turns in {STILL_S:g} s: hold them still"
 
 
 def to_calibrate(boards: Mapping[str, Board], *, again: bool) -> dict[str, tuple[str, ...]]:
-    """Return the axes to calibrate, by module: those that are not, or all."""
+    """Return the axes to calibrate by module: the uncalibrated ones, or all with `again`."""
     axes = {m: AXES if again else uncalibrated(board) for m, board in boards.items()}
     return {module: those for module, those in axes.items() if those}
 
@@ -354,9 +356,9 @@ def to_calibrate(boards: Mapping[str, Board], *, again: bool) -> dict[str, tuple
 def refuse_standing(
     robot: RobotConfig, run_dir: Path, found: FoundBoards, axes: Mapping[str, Sequence[str]]
 ) -> None:
-    """Refuse a robot that may bear weight: a drive is armed, or a limp leg rests on something.
+    """Raise DriveError if a robot may bear weight: a drive is armed, or a limp leg rests.
 
-    Drives that are not on USB are listened to on CAN. A leg is judged where it has its zeros.
+    Drives that are not on USB are monitored on CAN. A leg is judged only if it is zeroed.
     """
     q: dict[str, Pair] = {}
     for module in MODULES:
@@ -369,8 +371,8 @@ def refuse_standing(
             states = _can_states(robot, module, run_dir)
         if AxisState.CLOSED_LOOP_CONTROL in states:
             raise DriveError(
-                f"the drive of {module} is armed: the robot may stand on it. Hang the robot; "
-                "`xrl down`, or switch its supply off"
+                f"the drive of {module} is armed: the robot may stand on it. Hang the robot, then "
+                "run `xrl down` or switch its supply off"
             )
     for module in axes:
         leg = leg_of(module)
@@ -381,7 +383,7 @@ def refuse_standing(
 
 
 def _can_states(robot: RobotConfig, module: str, run_dir: Path) -> tuple[int, ...]:
-    """Return the states of a module's axes by their heartbeats on CAN; none if nobody speaks."""
+    """Return the states of a module's axes from their heartbeats on CAN; silent axes have none."""
     wiring = robot.module_named(module)
     seconds = can_monitor.long_enough(robot.drive.heartbeat_period_ms)
     bus = can_monitor.bus_config(robot, wiring.bus, run_dir)
@@ -401,15 +403,15 @@ def calibrate(
 ) -> int:
     """Ask and calibrate, one module after the other; return the exit code.
 
-    One that fails does not stop the others, unless it does not become idle.
+    A failed module does not stop the others, unless it does not become idle.
 
     Args:
-        console: to speak on.
-        robot: its file.
+        console: for questions and results.
+        robot: robot file.
         boards: by module, with the axes to calibrate.
-        interrupts: kept while an axis calibrates.
+        interrupts: deferred while an axis calibrates.
         yes: do not ask.
-        check: raises an error if another program has the drives by now.
+        check: raises an error if another program now holds the drives.
     """
     code, done = 0, list[str]()
     for module, (board, those) in boards.items():
@@ -417,20 +419,20 @@ def calibrate(
             refuse_unfit(module, board, those)
             seconds = sum(p.seconds for axis in those for p in procedures(board, axis))
             console.print(
-                f"\n{module}: {' and '.join(those)}, {seconds:.0f} s; each turns its motor by "
+                f"\n{module}: {' and '.join(those)}, {seconds:.0f} s; each axis turns its motor by "
                 "about a turn and back, which moves phi and theta by 0.2 rad"
             )
             if not drive_access.confirm(
-                "Does its leg hang free, all hands off, the power switch at hand?", yes=yes
+                "Does its leg hang free, with hands off and the power switch in reach?", yes=yes
             ):
-                console.print(f"{module} and what comes after it were not calibrated")
+                console.print(f"{module} and the modules after it were not calibrated")
                 return DECLINED_EXIT_CODE
             check()  # a person may take minutes to answer
             with interrupts.kept(), console.status(module) as status:
                 result = calibrate_board(board, those, interrupts, partial(_show, status, module))
         except DriveError as error:
             console.print(marked("[bold red]{}[/]: {}", module, error))
-            console.print("what it was at ends by itself; switch its supply off and on after that")
+            console.print("its calibration ends on its own; then switch its supply off and on")
             code = FAULT_EXIT_CODE
             continue
         good = tell(console, robot, module, result)
@@ -441,8 +443,8 @@ def calibrate(
     rest = [module for module in boards if module not in done]
     if done:
         console.print(
-            f"calibrated, and so without a zero: {', '.join(done)}; next `xrl drive zero`, "
-            "for each: MODULE --at PHI,THETA"
+            f"calibrated, and therefore unzeroed: {', '.join(done)}; next, run `xrl drive zero "
+            "MODULE --at PHI,THETA` for each"
         )
     if rest:
         console.print(f"not calibrated: {', '.join(rest)}")
@@ -450,7 +452,7 @@ def calibrate(
 
 
 def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult) -> bool:
-    """Print what came of a board's calibrations; return False if something is to be done."""
+    """Print the result of a board's calibrations; return False if it needs action."""
     for axis, found in result.found.items():
         console.print(
             f"{module}.{axis}: {found.resistance:.3g} ohm, {1e6 * found.inductance:.3g} uH, "
@@ -462,7 +464,7 @@ def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult)
             console.print(marked("[bold red]{}: {}[/]", module, NOT_IDLE))
         else:
             console.print(
-                "nothing of it was saved; the board has restarted with what it had, without a zero"
+                "nothing was saved; the board has restarted with its old settings, without a zero"
             )
         return False
     values = {f"{axis}.encoder.is_ready": True for axis in result.found} | {

@@ -1,8 +1,8 @@
 """Monitors a CAN bus of the robot for a moment, and judges its drives, load cells and IMU.
 
 Nothing is sent to a bus whose services are up: any frame feeds a drive's watchdog, and would hide a
-dead service. Else each axis gets three requests: its version, which only firmware 0.6 answers, its
-encoder's count, which only 0.5 does, and its supply's voltage.
+dead service. Otherwise each axis gets three requests: its version, which only firmware 0.6 answers;
+its encoder count, which only 0.5 answers; and its supply voltage.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from tools.fleet.process_table import SIMULATED_CAN
 LISTEN_S: Final = 0.5
 LISTEN_MAX_S: Final = 3.0
 HEARTBEATS: Final = 3.0
-"""Periods of the heartbeat that are listened for, at least."""
+"""Minimum number of heartbeat periods to listen for."""
 
 QUESTIONS: Final = (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GET_VBUS)
 _WAIT_S = 0.05
@@ -52,16 +52,16 @@ class NodeTraffic(msgspec.Struct):
     """Frames of one axis."""
 
     heartbeat: Heartbeat | None = None
-    """The newest, as firmware 0.5 means it."""
+    """Newest heartbeat, decoded as in firmware 0.5."""
     heartbeats_s: list[float] = []
-    """When they came."""
+    """Times of arrival, s."""
     estimates_s: list[float] = []
     pos_turns: float | None = None
-    """The newest estimate; firmware 0.5.6 says 0 until its first closed loop."""
+    """Newest estimate; firmware 0.5.6 reports 0 until its first closed loop."""
     shadow_count: int | None = None
-    """Where its encoder is, in counts: the answer of firmware 0.5."""
+    """Encoder count, which only firmware 0.5 answers."""
     version: Version | None = None
-    """The answer of firmware 0.6; 0.5 gives none."""
+    """Version, which only firmware 0.6 answers."""
     vbus_voltage: float | None = None
 
 
@@ -69,7 +69,7 @@ S = TypeVar("S")
 
 
 class SensorTraffic(msgspec.Struct, Generic[S]):
-    """Samples of a sensor, and when they came."""
+    """Samples of a sensor, and their times of arrival."""
 
     samples: list[S] = []
     times_s: list[float] = []
@@ -79,12 +79,12 @@ class BusTraffic(msgspec.Struct):
     """Traffic of one bus."""
 
     trouble: str = ""
-    """Why it could not be listened to."""
+    """Why the bus could not be monitored; "" if it could."""
     seconds: float = 0.0
     frames: int = 0
     error_frames: int = 0
     nodes: dict[int, NodeTraffic] = {}
-    """By node id: those that should be there, and whoever else sends heartbeats."""
+    """By node id: the expected nodes, and others that send heartbeats."""
     cells: SensorTraffic[Vector6] = msgspec.field(default_factory=SensorTraffic)
     imu: SensorTraffic[ImuSample] = msgspec.field(default_factory=SensorTraffic)
     malformed: int = 0
@@ -100,7 +100,7 @@ def listen(
     imu: bool = False,
     seconds: float = LISTEN_S,
 ) -> BusTraffic:
-    """Listen to a bus for axes, load cells and an IMU; ask axes only where no services are up."""
+    """Listen to a bus for axes, load cells and an IMU; poll axes only if no services are up."""
     traffic = BusTraffic(nodes={node: NodeTraffic() for node in nodes})
     try:
         with _bus(config) as bus:
@@ -120,9 +120,9 @@ def listen(
 def listen_to(
     robot: RobotConfig, name: str, run_dir: Path, *, poll_nodes: bool, seconds: float | None = None
 ) -> BusTraffic:
-    """Listen to a bus of a robot for all that should be on it; without a time, long enough.
+    """Listen to a bus of a robot for all expected senders; the default time is long enough.
 
-    All times are of the fleet's clock in `run_dir`: in slow motion no frame is late.
+    All times are by the fleet's clock in `run_dir`, so no frame is late in slow motion.
     """
     keep_pace(run_dir)
     nodes = bus_nodes(robot)[name]
@@ -140,7 +140,7 @@ def bus_config(robot: RobotConfig, name: str, run_dir: Path) -> CanConfig:
 
 
 def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
-    """Return the nodes that should be on each bus, also where there are none."""
+    """Return the expected nodes of each bus, including buses without nodes."""
     nodes: dict[str, tuple[int, ...]] = dict.fromkeys(robot.buses, ())
     for module in robot.module:
         nodes[module.bus] = (*nodes[module.bus], *module.node_ids)
@@ -149,7 +149,7 @@ def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
 
 @contextlib.contextmanager
 def _bus(config: CanConfig) -> Iterator[can.BusABC]:
-    """Open a bus; all that goes wrong with it is a DriveError."""
+    """Open a bus; every error becomes a DriveError."""
     try:
         with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
             yield bus
@@ -165,8 +165,8 @@ def long_enough(heartbeat_period_ms: int) -> float:
 def period_ms(times_s: Sequence[float], wanted_ms: float) -> float | None:
     """Return the period of frames, ms; None if there are too few.
 
-    It is the median gap or the mean, whichever is nearer to the wanted one: a reader that stalls
-    shifts the mean, a sender that catches up the median, another setting both.
+    It is the median or the mean of the gaps, whichever is nearer to the wanted period. A reader
+    that stalls shifts the mean, a sender that catches up the median, and another setting both.
     """
     gaps = [after - before for before, after in pairwise(times_s)]
     if len(gaps) < _GAPS_MIN:
@@ -210,7 +210,7 @@ def _add(sensor: SensorTraffic[S], sample: S | None, message: can.Message) -> No
 
 
 def _of_node(message: can.Message, nodes: dict[int, NodeTraffic]) -> None:
-    """Take in a frame as an axis sends it; a heartbeat makes a node known that was not."""
+    """Store a frame from an axis; a heartbeat adds a node that was not expected."""
     node, command = cansimple.split_id(message.arbitration_id)
     data = bytes(message.data)
     if command == Command.HEARTBEAT:
@@ -233,7 +233,7 @@ def _of_node(message: can.Message, nodes: dict[int, NodeTraffic]) -> None:
 
 
 PERIOD_SHARE: Final = 0.2
-"""A measured period may differ by this much: more is a setting, and not a busy machine."""
+"""Maximum relative error of a measured period: more is a setting, not a busy machine."""
 TWICE: Final = 0.65
 """Fraction of the wanted period below which two axes share one node id."""
 RATE_SHARE: Final = 0.2
@@ -242,7 +242,7 @@ RATE_SHARE: Final = 0.2
 def drive_rows(
     robot: RobotConfig, module: str, traffic: BusTraffic, *, services_up: bool
 ) -> list[Finding]:
-    """Judge a module's two axes by what came on its bus."""
+    """Judge a module's two axes from the traffic on its bus."""
     bus, node_ids = robot.module_named(module).bus, robot.module_named(module).node_ids
     if traffic.trouble:
         return [_closed(robot, module, bus, traffic)]
@@ -250,9 +250,9 @@ def drive_rows(
         heard = (node for node, other in traffic.nodes.items() if other.heartbeat)
         strangers = ", ".join(map(str, sorted(set(heard) - set(node_ids))))
         fix = (
-            f"nodes {strangers} are heard: set `node_ids`, or the drive's"
+            f"nodes {strangers} send instead: set `node_ids`, or the drive's node ids"
             if strangers
-            else "supply, wires, 120 ohm at both ends; the drive's baud rate must be 1000000"
+            else "check supply, wires, 120 ohm at both ends; the drive's baud rate must be 1000000"
         )
         found = f"{traffic.frames} frames, {traffic.error_frames} errors"
         return [wrong(module, "heartbeats", found, f"nodes {node_ids[0]}, {node_ids[1]}", fix)]
@@ -261,63 +261,63 @@ def drive_rows(
         known = traffic.nodes.get(node, NodeTraffic())
         rows += _axis_rows(robot, f"{module}.{axis}", node, known, services_up=services_up)
     if traffic.error_frames:
-        fix = "wires, 120 ohm at both ends, one baud rate"
+        fix = "check wires, 120 ohm at both ends, and equal baud rates"
         found = f"{traffic.error_frames} in {traffic.seconds:.1f} s"
         rows.append(warning(module, "CAN error frames", found, "none", fix))
     return rows
 
 
 def harness_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
-    """Judge the load cells by what came on their bus."""
+    """Judge the load cells from the traffic on their bus."""
     subject, what, harness, cells = "harness", "load cells", robot.harness, traffic.cells
     if traffic.trouble:
         return [_closed(robot, subject, harness.bus, traffic)]
     if not cells.samples:
-        fix = "the amplifier's supply and wires; its frames are in shared/can/sensor_frames.py"
+        fix = "check the amplifier's supply and wires, and frames (shared/can/sensor_frames.py)"
         why = "no assist force, no easing, no stop at overload"
         found, wanted = f"{traffic.frames} other frames", f"{harness.rate_hz:g} Hz"
         return [wrong(subject, what, found, wanted, fix, why)]
     largest = max(abs(force) for sample in cells.samples for force in sample)
     good = largest < harness.leg_force_max  # NaN is not
-    fix = "unload the harness; a cell that stays there is broken, or its wire"
+    fix = "unload the harness; if the reading stays, the cell or its wire is broken"
     found, limit = f"{largest:.0f} N", f"< {harness.leg_force_max:g} N"
-    rate_fix = "the amplifier's rate, or `harness.rate_hz`"
+    rate_fix = "set the amplifier's rate, or `harness.rate_hz`"
     return [
         _rate_row(subject, what, cells, harness.rate_hz, rate_fix),
-        judged(good, subject, "largest force", found, limit, fix, "saturated, not valid"),
+        judged(good, subject, "largest force", found, limit, fix, "saturated and not valid"),
         *_lost_frames(subject, traffic),
     ]
 
 
 def imu_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
-    """Judge the IMU by what came on its bus."""
+    """Judge the IMU from the traffic on its bus."""
     subject, what, imu, samples = "IMU", "samples", robot.imu, traffic.imu.samples
     if traffic.trouble:
         return [_closed(robot, subject, imu.bus, traffic)]
     why = "the planner assumes a level floor"
     if not samples:
-        fix = "its supply and wires, its CAN output; its frames are in shared/can/sensor_frames.py"
-        found = f"{traffic.frames} frames that give no attitude"
+        fix = "check its supply, wires, CAN output and frames (shared/can/sensor_frames.py)"
+        found = f"{traffic.frames} frames without an attitude"
         return [wrong(subject, what, found, f"{imu.rate_hz:g} Hz", fix, why)]
     known = sum(sample.valid for sample in samples)
     found, good = f"{known} of {len(samples)} samples", known == len(samples)
-    fix = "leave it still for a minute; its status word says that its filter has not settled"
+    fix = "leave it still for a minute; its status word reports that its filter has not settled"
     return [
-        _rate_row(subject, what, traffic.imu, imu.rate_hz, "its output rate, or `imu.rate_hz`"),
+        _rate_row(subject, what, traffic.imu, imu.rate_hz, "set its output rate, or `imu.rate_hz`"),
         judged(good, subject, "orientation valid", found, "all", fix, why),
         *_lost_frames(subject, traffic),
     ]
 
 
 def _closed(robot: RobotConfig, subject: str, name: str, traffic: BusTraffic) -> Finding:
-    """Return the row of a bus that cannot be listened to."""
+    """Return the row of a bus that cannot be monitored."""
     bus, trouble = robot.can[name], traffic.trouble
     if bus.interface == SIMULATED_CAN:
-        fix = "the simulator of this fleet is not there: `xrl status`, or `xrl down`, `xrl up`"
+        fix = "this fleet's simulator is missing: see `xrl status`, or run `xrl down` and `xrl up`"
     elif bus.interface != "socketcan":
-        fix = f"python-can's {bus.interface} on {bus.channel}: its adapter, its driver"
+        fix = f"python-can's {bus.interface} on {bus.channel}: check its adapter and driver"
     elif os.strerror(errno.EAFNOSUPPORT) in trouble:
-        fix = "`sudo modprobe can_raw`: this kernel has no CAN (a container, a small kernel)"
+        fix = "`sudo modprobe can_raw`: this kernel has no CAN (a container or a minimal kernel)"
     else:
         fix = up_command(bus.channel)
     return wrong(subject, "CAN bus", trouble, "open", fix)
@@ -333,18 +333,18 @@ def _rate_row(
 
 
 def _lost_frames(subject: str, traffic: BusTraffic) -> list[Finding]:
-    """Tell of a sensor's frames that were out of order: others were lost."""
+    """Report a sensor's frames that were out of order, which means that others were lost."""
     if not traffic.malformed:
         return []
-    fix = "frames are lost: wires, 120 ohm at both ends"
+    fix = "frames are lost: check wires and 120 ohm at both ends"
     return [warning(subject, "frames out of order", str(traffic.malformed), "none", fix)]
 
 
 def positions(robot: RobotConfig, module: str, traffic: BusTraffic) -> tuple[float, float] | None:
     """Return both motors' positions in turns, as the drive counts them; None without a reply.
 
-    From the count where the estimate is 0, as in firmware 0.5.6 until its first closed loop: where
-    the count was not answered nothing is known.
+    The count is used where the estimate is 0, as in firmware 0.5.6 until its first closed loop. If
+    the drive did not answer with a count, the position is unknown.
     """
     first, second = (
         _turns(traffic.nodes.get(node, NodeTraffic()), robot.joint.encoder_counts_per_turn)
@@ -363,14 +363,14 @@ def _axis_rows(
     robot: RobotConfig, subject: str, node: int, traffic: NodeTraffic, *, services_up: bool
 ) -> list[Finding]:
     if traffic.heartbeat is None:
-        fix = f"node {node} in `node_ids`, or the drive's config.can.node_id and heartbeat_rate_ms"
+        fix = f"check {node} in `node_ids`, the drive's config.can.node_id and heartbeat_rate_ms"
         return [wrong(subject, "heartbeat", f"node {node} silent", "traffic", fix)]
     if traffic.version is not None:
         found = describe_firmware(traffic.version.firmware)
         fix = "the settings of firmware 0.6 are not read back yet: check them in its web GUI"
-        return [warning(subject, "firmware", found, "0.5.6", fix, "other settings, other errors")]
+        return [warning(subject, "firmware", found, "0.5.6", fix, "settings and errors differ")]
     drive = robot.drive
-    # Errors by the flags too: `axis_error` alone can stay 0.
+    # Use the flags too: `axis_error` alone can stay 0.
     errors = traffic.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
     words = describe_flags(AxisError, errors) if errors else "none"
     beats, estimates = traffic.heartbeats_s, traffic.estimates_s
@@ -388,13 +388,13 @@ def _period(
     module = subject.partition(".")[0]
     measured = period_ms(times_s, wanted_ms)
     if len(times_s) > 2 and _mean_ms(times_s) < TWICE * wanted_ms:
-        measured = _mean_ms(times_s)  # two senders: gaps of 1 and 19 ms have a median like one's
+        measured = _mean_ms(times_s)  # two senders: gaps of 1 and 19 ms have one sender's median
     wanted = f"{wanted_ms:g} ms"
-    fix = f"config.can.{setting}: `xrl drive configure --apply --module {module}`"
+    fix = f"set config.can.{setting}: `xrl drive configure --apply --module {module}`"
     if measured is None and not times_s:
         return wrong(subject, what, "none", wanted, fix, "they are the joint service's clock")
     if measured is None:
-        return warning(subject, what, f"{len(times_s)} heard", wanted, fix)
+        return warning(subject, what, f"{len(times_s)} received", wanted, fix)
     why = "or this machine is too busy"
     if measured < TWICE * wanted_ms:
         why = "or a second axis on this bus has the same node id"

@@ -1,4 +1,4 @@
-"""Checks of ODrives: one board's settings and state, and each board beside the others. Pure."""
+"""Checks of ODrives: settings and state of one board, and comparison of all boards. Pure."""
 
 from __future__ import annotations
 
@@ -30,25 +30,24 @@ from tools.bringup.findings import Finding, advised, judged, ok, warning, wrong
 Values = Mapping[str, Value]
 
 OVERVOLTAGE_SHARE: Final = 0.95
-"""Fraction of the trip level; a supply closer to it leaves braking legs no room."""
+"""Maximum supply voltage, as a fraction of the trip level: braking legs need the rest."""
 
 TEMPERATURES: Final = (-10.0, 70.0)
-"""C; of an output stage that is idle."""
+"""Valid range of an idle output stage, C."""
 
-FIND_CAUSE: Final = "find the cause; arming by `xrl up` clears it, and so does power off and on"
+FIND_CAUSE: Final = "find the cause; arming by `xrl up` clears it, as does a power cycle"
 
 Boards = Mapping[str, Mapping[str, Value]]
 """By module: a board's settings and readings."""
 
 BOARDS_MIN: Final = 3
-"""With fewer nobody knows which one is the odd one."""
+"""With fewer boards it is unclear which one differs from the rest."""
 MEASURED: Final = ("motor.config.phase_resistance", "motor.config.phase_inductance")
 """Calibration results; similar for motors of one kind."""
 MEASURED_SHARE: Final = 0.3
-"""Fraction of the median by which a value may differ: copper at 100 C has 30 % more than at 20
-C."""
+"""Maximum deviation from the median, as a fraction: copper at 100 C has 30 % more than at 20 C."""
 VOLTS_APART: Final = 1.0
-"""Boards on one supply, at rest, and their tolerance."""
+"""Maximum deviation from the median voltage, V: tolerance of boards on one supply, at rest."""
 
 _OWN: Final = frozenset(
     {setting.name for setting in (*AXIS_TABLE, *DRIVE_TABLE)}
@@ -62,7 +61,8 @@ _OWN: Final = frozenset(
         *("controller.config.anticogging.index", "motor.config.direction"),
     }
 )
-"""Below the axis: compared with the robot file, found by calibration, or written by services."""
+"""Settings, without their axis, that are not compared between boards: they are compared with the
+robot file, found by calibration, or written by services."""
 
 
 def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
@@ -76,12 +76,12 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
     if is_known(firmware):
         why = "settings may have other names or defaults"
         return advised(firmware == FIRMWARE, module, "firmware", found, wanted, fix, why)
-    why = "other settings, other errors, other CAN frames: nothing can be compared"
+    why = "settings, errors and CAN frames differ, so nothing can be compared"
     return wrong(module, "firmware", found, wanted, fix, why)
 
 
 def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values) -> list[Finding]:
-    """Compare a board's settings with the wanted ones; all that fit make one row."""
+    """Compare a board's settings with the wanted ones; all that match make one row."""
     rows = []
     fix = f"`xrl drive configure --apply --module {module}`"
     for setting in wanted:
@@ -89,7 +89,9 @@ def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values
         value = values.get(setting.name)
         words = setting.describe()
         if not isinstance(value, bool | int | float):
-            rows.append(warning(subject, name, "not there", words, "firmware 0.5.6", setting.why))
+            rows.append(
+                warning(subject, name, "missing", words, "needs firmware 0.5.6", setting.why)
+            )
         elif not setting.fits(value):
             by_hand = CALIBRATE if name.endswith("pre_calibrated") else fix
             rows.append(wrong(subject, name, describe_value(value), words, by_hand, setting.why))
@@ -98,18 +100,18 @@ def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values
 
 
 def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Finding]:
-    """Judge which way currents count, as each axis's encoder calibration has found it.
+    """Judge the sign of the currents, as each axis's encoder calibration has found it.
 
-    The firmware turns the torque round where it is -1, so that the motion is the same; its
-    currents then have the other sign. USB reads both; CAN of firmware 0.5 the currents only.
-    An axis that is not calibrated has none.
+    If the direction is -1, the firmware inverts the torque: the motion is the same, but its
+    currents have the opposite sign. USB reads direction and currents; CAN of firmware 0.5 reads
+    only the currents. An uncalibrated axis has no direction.
     """
     over_can = robot.joint_service.driver == "odrive_can"
     fix = (
         "swap two of the motor's phases and calibrate again; `motor_signs` is for mirrored legs, "
         "not for this"
     )
-    why = "CAN does not report it: a service that takes the drive over would reverse its torque"
+    why = "CAN does not report it: a service that takes over the drive would reverse its torque"
     rows = []
     for axis in AXES:
         value = values.get(f"{axis}.{DIRECTION}")
@@ -125,7 +127,7 @@ def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Find
 def error_rows(module: str, values: Values) -> list[Finding]:
     """Return rows for the board's error registers; one row if there is no error.
 
-    Arming clears them all, so a watchdog that expired while no service ran is no fault.
+    Arming clears them all, so a watchdog that expired while no service ran is not a fault.
     """
     rows = []
     if error := int(number(values, "error")):
@@ -148,7 +150,7 @@ def condition_rows(
     rows = [_voltage(module, number(values, "vbus_voltage"), trip_levels)]
     if values.get("config.enable_brake_resistor") and "brake_resistor_armed" in values:
         armed = bool(values["brake_resistor_armed"])
-        fix = "look at `brake_resistance` and its wires; power off and on"
+        fix = "check `brake_resistance` and its wires; power off and on"
         why = "neither axis arms without it"
         found = "armed" if armed else "not armed"
         rows.append(judged(armed, module, "brake resistor", found, "armed", fix, why))
@@ -162,7 +164,7 @@ def condition_rows(
             for part, name in (("motor", "motor.is_calibrated"), ("encoder", "encoder.is_ready"))
             if not values.get(f"{axis}.{name}")
         ]
-        found, why = f"{' and '.join(lacking)} not" if lacking else "yes", "it does not arm"
+        found, why = f"{' and '.join(lacking)} not" if lacking else "yes", "it cannot be armed"
         rows.append(judged(not lacking, subject, "calibrated", found, "yes", CALIBRATE, why))
         state = int(number(values, f"{axis}.current_state"))
         rows.append(state_row(subject, state, services_up=services_up))
@@ -170,30 +172,30 @@ def condition_rows(
 
 
 def state_row(subject: str, state: int, *, services_up: bool) -> Finding:
-    """Judge an axis's state: idle, or in closed loop where a joint service has it."""
+    """Judge an axis's state: idle, or in closed loop if a joint service holds it."""
     known = state in AxisState.__members__.values()
     found = AxisState(state).name.lower().replace("_", " ") if known else str(state)
     if state == AxisState.IDLE:
         return ok(subject, "state", found, "idle")
     if state == AxisState.CLOSED_LOOP_CONTROL and services_up:
         return ok(subject, "state", found, "armed by its service")
-    fix = "hang the robot; `xrl up` takes it over, power off lets it go"
+    fix = "hang the robot; `xrl up` takes it over, power off releases it"
     return warning(subject, "state", found, "idle", fix, "it moves or holds without a service")
 
 
 def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Finding]:
-    """Judge where a module's joint is, by its motors' positions as the drive counts them."""
+    """Judge the position of a module's joint from its motors' positions, as the drive counts."""
     mark, again = robot.drive.zero_mark_turns, f"`xrl drive zero {module} --at PHI,THETA`"
     a, b = turns[0] - mark, turns[1] - mark
     if mark > 0.0 and max(abs(a), abs(b)) > 0.5 * mark:
         found = f"motors at {turns[0]:.1f}, {turns[1]:.1f} turns"
-        why = "it lost its zero with the power, and is not armed without one"
+        why = "it lost its zero with the power, and cannot be armed without a zero"
         return [wrong(module, "zero", found, f"about {mark:g}", again, why)]
     q = joint_from_motor((a, b), robot.joint.gear_ratio)
     rows = [ok(module, "zero", "known", "known")]
     limits = robot.joint_limits()[2 * MODULE_INDEX[module] :][:2]
-    fix = f"move it there by hand; if it is there, {again}"
-    why = "it is not armed outside of its limits"
+    fix = f"move it there by hand; if it is already there, run {again}"
+    why = "it cannot be armed outside its limits"
     for name, angle, (low, high) in zip(JOINT_AXES, q, limits, strict=True):
         inside, found, wanted = low <= angle <= high, f"{angle:.2f} rad", f"{low:g} to {high:g}"
         rows.append(judged(inside, f"{module}.{name}", "angle", found, wanted, fix, why))
@@ -209,8 +211,8 @@ def describe_flags(kind: type[IntFlag], bits: int) -> str:
 
 def _temperature(subject: str, celsius: float) -> Finding:
     low, high = TEMPERATURES
-    fix = "let it cool; a reading that stays is a broken thermistor: another board"
-    why = "from 100 C on the drive cuts its current, at 120 C it disarms"
+    fix = "let it cool; if the reading stays, the thermistor is broken: replace the board"
+    why = "from 100 C the drive reduces its current, at 120 C it disarms"
     good, found = low <= celsius <= high, f"{celsius:.0f} C"  # NaN is not good
     return advised(good, subject, "temperature", found, f"{low:g} to {high:g} C", fix, why)
 
@@ -220,11 +222,11 @@ def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Fin
     wanted = f"{low:g} to {high:g} V"
     found = f"{volts:.1f} V"
     if volts <= low:
-        return wrong(module, "supply", found, wanted, "switch the supply on; look at its fuse")
+        return wrong(module, "supply", found, wanted, "switch the supply on; check its fuse")
     if volts >= high:
-        return wrong(module, "supply", found, wanted, "a lower supply, or another board")
+        return wrong(module, "supply", found, wanted, "use a lower supply, or another board")
     if volts > OVERVOLTAGE_SHARE * high:
-        fix = "a lower supply: braking legs raise it"
+        fix = "use a lower supply: braking legs raise it"
         return warning(module, "supply", found, f"< {OVERVOLTAGE_SHARE * high:.1f} V", fix)
     return ok(module, "supply", found, wanted)
 
@@ -235,7 +237,10 @@ def trip_levels_of(values: Values) -> tuple[float, float]:
         number(values, f"config.dc_bus_{name}voltage_trip_level") for name in ("under", "over")
     )
     if low >= high:
-        raise DriveError(f"its voltage trip levels are crossed: {low:g} V and {high:g} V")
+        raise DriveError(
+            f"its undervoltage trip level, {low:g} V, must be below its overvoltage trip level, "
+            f"{high:g} V"
+        )
     return low, high
 
 
@@ -246,7 +251,7 @@ def _split_name(module: str, name: str) -> tuple[str, str]:
 
 
 def alike_rows(boards: Boards) -> list[Finding]:
-    """Return the settings in which few boards differ from most, and values that no motor has."""
+    """Return settings in which few boards differ from most, and implausible motor values."""
     if len(boards) < BOARDS_MIN:
         return []
     names = dict.fromkeys(name for values in boards.values() for name in values)
@@ -262,12 +267,12 @@ def _is_shared(name: str) -> bool:
 
 
 def _odd_ones(name: str, boards: Boards) -> list[Finding]:
-    """Return a row for each board that has a setting otherwise than more than half of them."""
+    """Return a row for each board whose setting differs from that of more than half of them."""
     words = {module: describe_value(values.get(name)) for module, values in boards.items()}
     usual, count = Counter(words.values()).most_common(1)[0]
     if count == len(boards) or 2 * count <= len(boards):
         return []
-    fix = "in `odrivetool`, and `save_configuration()`; or it is intended"
+    fix = "set it in `odrivetool` and call `save_configuration()`, unless it is intended"
     wanted = f"{usual}, as {count} others"
     why = "a board with other settings behaves differently"
     return [
@@ -288,13 +293,13 @@ def _measured_rows(name: str, boards: Boards) -> list[Finding]:
         return []
     usual = median(found.values())
     rows = []
-    fix = "look at its three phase wires; calibrate it again (docs/bring-up.md, section 5)"
+    fix = "check its three phase wires; calibrate it again (docs/bring-up.md, section 5)"
     for (module, axis), value in found.items():
         subject, words = f"{module}.{axis}", describe_value(value)
         if not value > 0.0:
             calibrated = boards[module].get(f"{axis}.motor.is_calibrated")
             if calibrated:
-                why = "its current loop has no gains from it"
+                why = "it gives no gains for the current loop"
                 rows.append(wrong(subject, name, words, "> 0", fix, why))
         elif abs(value - usual) > MEASURED_SHARE * usual:
             why = "a loose or broken phase, or another motor"
@@ -309,7 +314,7 @@ def _supply_rows(boards: Boards) -> list[Finding]:
         if isinstance(value := values.get("vbus_voltage"), int | float)
     }
     usual = median(volts.values()) if volts else 0.0
-    fix = "its own fuse, plug and wires: the boards hang on one supply"
+    fix = "check its own fuse, plug and wires: the boards share one supply"
     return [
         warning(module, "supply", f"{value:.1f} V", f"about {usual:.1f} V, as the others", fix)
         for module, value in volts.items()

@@ -1,4 +1,4 @@
-"""Checks of this host: computer, kernel's CAN interfaces, robot file, bus, keys."""
+"""Checks of this host: computer, the kernel's CAN interfaces, robot file, bus and keys."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tools.keys.inspection import inspect_keys
 MACHINE: Final = "machine"
 CPUS_MIN: Final = 2
 CPUS_FOR_1_KHZ: Final = 4
-"""Two carry the fleet at 500 Hz (docs/results.md)."""
+"""Two processors carry the fleet at 500 Hz (docs/results.md)."""
 CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
 """Clock sources that are read without a system call."""
 ODRIVE_VENDOR: Final = "1209"
@@ -45,24 +45,26 @@ UDEV_FIX: Final = (
     "plug in again"
 )
 LIMIT_FIX: Final = (
-    "`YOU - {} {}` in /etc/security/limits.d/xrl.conf and log in again, or systemd's Limit{}={}"
+    "put `YOU - {} {}` in /etc/security/limits.d/xrl.conf and log in again, or set systemd's "
+    "Limit{}={}"
 )
 CLOCK_FIX: Final = "`sudo apt-get install chrony`, or `sudo timedatectl set-ntp true`"
 RTPRIO_FIX: Final = LIMIT_FIX.format("rtprio", 40, "RTPRIO", 40)
 MEMLOCK_FIX: Final = LIMIT_FIX.format("memlock", "unlimited", "MEMLOCK", "infinity")
 
 _TIMEX_BYTES: Final = 256
-"""At least the size of `struct timex` of <sys/timex.h>; all zeros ask and change nothing."""
+"""At least the size of `struct timex` of <sys/timex.h>; with all zeros the call only reads."""
 _TIME_ERROR: Final = 5
 """State of a clock that is not synchronised."""
 
 
 Links = Mapping[str, Mapping[str, Any]]
-"""By interface: what `ip` says of it."""
+"""Output of `ip` by interface."""
 
 QUEUE: Final = (32, 100)
-"""Frames. deploy/udev/92-can.rules sets 64 and says why; the kernel's default is 10. More than 100
-take longer than a joint service waits for a frame to be carried (`bus_watch.STUCK_MS`)."""
+"""Valid lengths of a send queue, frames. deploy/udev/92-can.rules sets 64 and says why; the
+kernel's default is 10. More than 100 frames take longer than a joint service waits for a frame to
+be sent (`bus_watch.STUCK_MS`)."""
 _IP: Final = ("ip", "-details", "-json", "link", "show", "type", "can")
 _IP_S = 2.0
 _IFF_UP = 1
@@ -74,13 +76,13 @@ FILE: Final = "robot file"
 
 
 def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
-    """Check the computer; another root of the file system for tests."""
+    """Check the computer; tests give another root of the file system."""
     emulated = is_simulated(robot)
     rows = [_cpus(), _real_time(emulated=emulated), *_delays(root, emulated=emulated)]
     # interpreted, the law's graphs only cost more time
     graphs = graphs_of(robot)
     there = sum(library_of(graph).is_file() for graph in graphs)
-    fix = f"with a C compiler `cc`: `{command()} --config FILE`"
+    fix = f"install a C compiler `cc` and run `{command()} --config FILE`"
     found = f"{there} of {len(graphs)} in C"
     rows.append(advised(there == len(graphs), MACHINE, "law's graphs", found, "all in C", fix))
     if emulated:
@@ -99,7 +101,7 @@ def usb_node_rows(root: Path) -> list[Finding]:
             bus, number = _text(device / "busnum"), _text(device / "devnum")
             nodes.append(root / f"dev/bus/usb/{int(bus):03d}/{int(number):03d}")
     if not nodes:
-        fix = "plug the USB cables in; settings are read over USB"
+        fix = "plug in the USB cables; settings are read over USB"
         return [warning("USB", "ODrives", "none plugged in", "one for each module", fix)]
     closed = [str(node) for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
     found = f"{len(closed)} closed" if closed else f"{len(nodes)} open"
@@ -107,7 +109,10 @@ def usb_node_rows(root: Path) -> list[Finding]:
 
 
 def _cpus() -> Finding:
-    cpus, fix = os.sched_getaffinity(0), "another computer, or more processors (taskset, container)"
+    cpus, fix = (
+        os.sched_getaffinity(0),
+        "allow more processors (taskset, container), or use another computer",
+    )
     right, left = (
         ",".join(map(str, sorted(scheduling.half_of(cpus, kind))))
         for kind in ("harness", "planner")
@@ -118,7 +123,7 @@ def _cpus() -> Finding:
 
 
 def _delays(root: Path, *, emulated: bool) -> list[Finding]:
-    """Check what makes a loop late now and then; all of it is ok on an emulated robot."""
+    """Check causes of late cycles; for an emulated robot all rows are ok."""
     governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governor = " and ".join(sorted({_text(file) for file in governors} - {""}))
     clock = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
@@ -131,13 +136,13 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
     rows = (
         (governor in ("", "performance"), "frequency governor", governor or "unknown here",
          "performance", "`sudo cpupower frequency-set -g performance`",
-         "a processor that sleeps is late"),
-        (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or alike",
-         "see in the kernel's log why it was dropped",
+         "a processor at a low frequency is late"),
+        (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or similar",
+         "find in the kernel's log why it was dropped",
          "every read of the clock costs a system call"),
         (synchronised, "wall clock", "synchronised" if synchronised else "not synchronised",
          "synchronised", CLOCK_FIX,
-         "certificates go by it, and records of several hosts are merged by it"),
+         "certificates and the merging of several hosts' records depend on it"),
         (may_lock, "locked memory", "allowed" if may_lock else locked, "allowed", MEMLOCK_FIX,
          "a page that must be read from disk stops a loop"),
         (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
@@ -148,7 +153,7 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
          "each cycle of a loop takes longer on a processor that was asleep"),
         (pause_ms <= 0.0, "real-time pause", f"{pause_ms:g} ms" if pause_ms else "none", "none",
          f"`sudo cp {FILES}/sysctl/90-xrl.conf /etc/sysctl.d/ && sudo sysctl --system`",
-         "for that time of each second the kernel stops what fills a processor: modules hold"),
+         "for this time each second the kernel stops a task that fills a processor: modules hold"),
     )  # fmt: skip
     return [advised(good or emulated, MACHINE, *row) for good, *row in rows]
 
@@ -161,16 +166,16 @@ def clock_is_synchronised() -> bool:
 
 def _real_time(*, emulated: bool) -> Finding:
     what, wanted = "real-time priority", "SCHED_FIFO"
-    # try it and go back: limits, capabilities and control groups all have their say
+    # try it and restore: limits, capabilities and control groups all matter
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(scheduling.TABLE["joint"].fifo))
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         return ok(MACHINE, what, "SCHED_FIFO allowed", wanted)
     fallback = scheduling.short_slice()
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    why = f"the services take {fallback} instead: late when the machine is busy"
+    why = f"the services use {fallback} instead, and are late when the machine is busy"
     if fallback == "normal priority":
-        why = "the loops come late when the machine is busy"
+        why = "the loops are late when the machine is busy"
     elif emulated:
         return ok(MACHINE, what, f"refused; instead: {fallback}", wanted)
     return warning(MACHINE, what, f"refused, RTPRIO {limit}", wanted, RTPRIO_FIX, why)
@@ -181,7 +186,9 @@ def _libusb() -> Finding:
     try:
         ctypes.CDLL("libusb-1.0.so.0")
     except OSError:
-        return wrong("USB", what, "not found", wanted, libusb_fix(), "no ODrive over USB")
+        return wrong(
+            "USB", what, "not found", wanted, libusb_fix(), "no access to ODrives over USB"
+        )
     return ok("USB", what, wanted, wanted)
 
 
@@ -208,8 +215,8 @@ def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding
     for name in _interfaces_of(robot):
         flags = _text(root / "sys/class/net" / name / "flags")
         if not flags:
-            fix = "plug the adapter in; `ip link` lists what is there"
-            rows.append(wrong(name, "interface", "not there", "up", fix))
+            fix = "plug in the adapter; `ip link` lists the interfaces"
+            rows.append(wrong(name, "interface", "missing", "up", fix))
             continue
         up = bool(int(flags, 16) & _IFF_UP)
         rows.append(judged(up, name, "interface", "up" if up else "down", "up", up_command(name)))
@@ -225,7 +232,7 @@ def _interfaces_of(robot: RobotConfig) -> list[str]:
 
 
 def up_command(name: str) -> str:
-    """Return how an interface is brought up."""
+    """Return the command that brings an interface up."""
     return f"`sudo ip link set {name} up type can bitrate {CAN_BAUD_RATE} restart-ms 100`"
 
 
@@ -237,34 +244,34 @@ def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
     bitrate, state = data.get("bittiming", {}).get("bitrate"), data.get("state")
     if bitrate is not None:
         good = abs(bitrate / CAN_BAUD_RATE - 1.0) < 1e-3
-        why = "not one frame gets through, and every node reports errors"
+        why = "no frame gets through, and every node reports errors"
         rows.append(judged(good, name, "bit rate", str(bitrate), str(CAN_BAUD_RATE), again, why))
     if state is not None:
         errors, wanted = data.get("berr_counter", {}), _WELL.lower()
         counted = f" (errors sent {errors.get('tx', 0)}, received {errors.get('rx', 0)})"
         found = state.lower() + (counted if any(errors.values()) else "")
-        fix = "120 ohm at both ends and nowhere else, ground wired along, one bit rate, short stubs"
+        fix = "check: 120 ohm at both ends only, a ground wire, the same bit rate, short stubs"
         why = "frames are resent and arrive late, or the bus goes off"
         row = advised(state == _WELL, name, "controller", found, wanted, fix, why)
         if state in _OFF:
-            why = "it takes no part in the bus"
+            why = "it does not take part in the bus"
             row = wrong(name, "controller", found, wanted, again, why)
         rows.append(row)
     if "LISTEN-ONLY" in data.get("ctrlmode", ()):
-        fix = f"`sudo ip link set {name} down`, then with `listen-only off`"
+        fix = f"`sudo ip link set {name} down`, then set it up with `listen-only off`"
         rows.append(wrong(name, "mode", "listen-only", "normal", fix, "nothing can be sent"))
     if data.get("restart_ms") == 0:
-        why = "after bus-off, as after a short, it stays down"
+        why = "after bus-off, for example from a short circuit, it stays down"
         rows.append(warning(name, "restart-ms", "0: off", "100", again, why))
     length = link.get("txqlen")
     if length is not None:
         low, high = QUEUE
         found, wanted = f"{length} frames", f"{low} to {high}"
-        fix = f"{FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`"
+        fix = f"install {FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`"
         why = "too short: it overflows at arming; too long: a plugged-in drive gets old frames"
         good = low <= length <= high
         rows.append(advised(good, name, "send queue", found, wanted, fix, why))
-    # in one-shot mode the controller itself drops a frame that nobody acknowledges
+    # in one-shot mode the controller itself drops a frame that no node acknowledges
     return rows if "ONE-SHOT" in data.get("ctrlmode", ()) else rows + _restart_rows(root, name)
 
 
@@ -279,8 +286,8 @@ def _restart_rows(root: Path, name: str) -> list[Finding]:
     ]
     allowed = [int(one[1], 16) >> _CAP_NET_ADMIN & 1 for one in capabilities if one is not None]
     if len(allowed) < len(capabilities):
-        return []  # a process is gone, or this is no Linux
-    fix = "run them by the unit of `xrl hosts`, or grant CAP_NET_ADMIN (docs/drives.md)"
+        return []  # a process is gone, or this is not Linux
+    fix = "run them from the unit of `xrl hosts`, or grant CAP_NET_ADMIN (docs/drives.md)"
     why = "a dozen frames stay in the queue through a power cut, and reach the drive after it"
     found = "allowed" if all(allowed) else "not allowed"
     what = "restart by the services"
@@ -288,11 +295,11 @@ def _restart_rows(root: Path, name: str) -> list[Finding]:
 
 
 def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
-    """Check the robot file; that it can be read at all is known by now."""
+    """Check a robot file that has been read successfully."""
     count = len(robot.assumed)
     found = f"{count} values assumed" if count else "all values measured"
     if count and process_table.is_simulated(robot):
-        assumed = ok(FILE, "assumed", f"{found}; the drives are emulated by them")
+        assumed = ok(FILE, "assumed", f"{found}; the emulated drives use them")
     elif count:
         fix = f"measure {', '.join(robot.assumed)}; then remove them from `assumed`"
         assumed = warning(FILE, "assumed", found, "none", fix)
@@ -307,7 +314,7 @@ def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
 
 
 def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
-    """Return the services that listen on their endpoints, whoever started them."""
+    """Return the services that listen on their endpoints, started by any user or program."""
     here = security.services_here(robot)
     return tuple(
         service
@@ -317,12 +324,12 @@ def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
 
 
 def joint_services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
-    """Return which of these have drives."""
+    """Return the joint services that listen on their endpoints."""
     return tuple(service for service in services_up(robot, run_dir) if service in MODULES)
 
 
 def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> list[Finding]:
-    """Check that the endpoints of the bus are free, or the fleet's."""
+    """Check that the endpoints of the bus are free, or used by the fleet."""
     what = "endpoints"
     if fleet_is_up:
         up = services_up(robot, run_dir)
@@ -330,7 +337,7 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
         silent = [module for module in MODULES if module not in up]
         if len(silent) in (0, len(MODULES)):
             return [ok("bus", what, found, "the fleet's")]
-        fix = f"`xrl status` says why {', '.join(silent)} is not there"
+        fix = f"`xrl status` shows why these do not listen: {', '.join(silent)}"
         return [wrong("bus", what, found, "all six modules", fix)]
     here = security.services_here(robot)
     listeners = [
@@ -342,7 +349,7 @@ def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> li
     try:
         process_table.check_free(listeners)
     except FleetError as error:
-        return [wrong("bus", what, str(error), "free", "`xrl down`, or another --run-dir")]
+        return [wrong("bus", what, str(error), "free", "run `xrl down`, or use another --run-dir")]
     return [ok("bus", what, f"{len(listeners)} free", "free")]
 
 
@@ -350,11 +357,11 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
     """Check `bus.security`, and under `mtls` each certificate that this host holds."""
     mode = robot.bus.security.mode
     if mode == "open":
-        fix = 'mode = "mtls", or "local" for one host (docs/security.md)'
-        why = "anyone who reaches a port commands the robot"
+        fix = 'set mode = "mtls", or "local" for one host (docs/security.md)'
+        why = "anyone who can reach a port can command the robot"
         return [warning("bus", "security", mode, "mtls or local", fix, why)]
     if mode == "local":
-        return [ok("bus", "security", mode, "only this user may link")]
+        return [ok("bus", "security", mode, "only this user may connect")]
     try:
         keys = inspect_keys(keys_folder(robot), robot)
     except XrlError as error:
@@ -363,9 +370,9 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
     for key in keys:
         what, until = f"key of {key.name}", f"from {key.begins} until {key.expires}"
         if key.wrong:
-            row = wrong("bus", what, key.wrong, "valid", "`xrl keys check`", "no link")
+            row = wrong("bus", what, key.wrong, "valid", "`xrl keys check`", "links fail")
         else:
-            why = "then no new links; existing links stay"
+            why = "then new links fail; existing links stay"
             found = key.warning or until
             row = advised(not key.warning, "bus", what, found, "valid", "`xrl keys renew`", why)
         rows.append(row)

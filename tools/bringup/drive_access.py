@@ -1,11 +1,11 @@
-"""Who holds the drives now, and how a verb of bring-up gets at them.
+"""Exclusive access of bring-up verbs to the drives, real or emulated.
 
-A drive has one master. Before a verb writes to one it asks whether a joint service has it; while
-it works, no fleet can be started in the same run directory.
+A drive has one master. Before a verb writes to a drive, it checks whether a joint service holds
+the drive. While the verb works, no fleet can be started in the same run directory.
 
-Emulated drives are looked at by the same code as real ones: over the emulated CAN buses, and with
-the genuine `odrive` package over the stand-in of libusb. A fleet that is up is looked at as it is;
-else the simulator runs alone for the while.
+Emulated drives are accessed by the same code as real ones: over the emulated CAN buses, and with
+the genuine `odrive` package over a stand-in for libusb. If no fleet is up, the simulator runs alone
+until the verb ends.
 """
 
 from __future__ import annotations
@@ -36,36 +36,36 @@ from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 
 STARTED_S: Final = 15.0
-"""Longest wait for the first frames of a simulator that was started."""
+"""Timeout for the first frames of a simulator that was just started, s."""
 UP_S: Final = 3.0
-"""The same where a fleet is up: its simulator may be dead, or another verb's that is starting."""
+"""The same if a fleet is up, s: its simulator may be dead, or still starting for another verb."""
 SETTLE_S: Final = 1.5
-"""Until an emulated robot hangs still in its hoist."""
+"""Time until an emulated robot hangs still in its hoist, s."""
 GONE: Final = (
-    "the drives were emulated for this command only, and the written values are gone; "
-    "`xrl up --only simulator` keeps them"
+    "the drives were emulated for this command only, and the written values are gone; to keep "
+    "them, run `xrl up --only simulator` first"
 )
 _POLL_S = 0.05
 
 
 def robot_file(flags: FleetRobotFlags) -> Path:
-    """Return the robot file: of the fleet that is up in `--run-dir`, else as `places.robot_file`.
+    """Return the robot file of the fleet that is up in `--run-dir`, else `places.robot_file`.
 
     Raises:
-        ConfigError: there is no fleet, and the file found may not be taken.
-        FleetError: `--config` is not the fleet's.
+        ConfigError: no fleet is up, and the file found belongs to another user.
+        FleetError: `--config` is not the fleet's robot file.
     """
     run = RunDir(flags.run_dir)
     manifest = run.read_manifest()
     if manifest is None or not is_up(run.path):
-        return Path(os.path.abspath(places.robot_file(flags.config)))  # noqa: PTH100 - links stay
+        return Path(os.path.abspath(places.robot_file(flags.config)))  # noqa: PTH100 - keeps links
     if flags.config is None:
         return Path(manifest.config)
     given = Path(os.path.abspath(flags.config))  # noqa: PTH100 - as the manifest has it
     if given != Path(manifest.config):
         raise FleetError(
             f"the fleet in {run.path} runs with {manifest.config}, not with {given}; "
-            "leave --config out, or name another fleet with --run-dir"
+            "remove --config, or choose another fleet with --run-dir"
         )
     return Path(manifest.config)
 
@@ -76,16 +76,16 @@ def is_up(run_dir: Path) -> bool:
 
 
 def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFleet | None:
-    """Return the fleet of this user's that has a joint service on a module's drive, or None.
+    """Return this user's fleet that has a joint service on a module's drive, or None.
 
-    In whatever run directory: two fleets may mean the same drive.
+    It may be in any run directory: two fleets may use the same drive.
     """
     drive = _drive_of(robot, module, RunDir(run_dir).path)
     for path in sorted(map(Path, procfs.fleets())):
         manifest = RunDir(path).read_manifest()
         if manifest is None:
             continue
-        with contextlib.suppress(XrlError):  # a file that has become unreadable since is ignored
+        with contextlib.suppress(XrlError):  # ignore a file that has become unreadable
             other = config_file.load_without_schedule(Path(manifest.config))
             services = [name for name in manifest.services if name in MODULES]
             if any(_drive_of(other, name, path) == drive for name in services):
@@ -94,7 +94,7 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFlee
 
 
 def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]:
-    """Return a unique id of a drive; of an emulated one with its run directory."""
+    """Return a unique id of a drive; an emulated drive's id includes its run directory."""
     wiring = robot.module_named(module)
     place = str(run_dir) if is_simulated(robot) else ""
     if robot.joint_service.driver == "odrive_usb":
@@ -104,22 +104,22 @@ def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]
 
 
 def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
-    """Refuse a module whose joint service is up: a drive has one master."""
+    """Raise FleetError if a module's joint service is up: a drive has one master."""
     fleet = service_on(robot, module, run_dir)
     if fleet is not None:
         raise FleetError(
-            f"{module}: its joint service in {fleet.run.path} has the drive; hang the robot and "
-            f"`xrl down --run-dir {shlex.quote(str(fleet.run.path))}` first"
+            f"{module}: its joint service in {fleet.run.path} holds the drive; hang the robot and "
+            f"run `xrl down --run-dir {shlex.quote(str(fleet.run.path))}` first"
         )
 
 
 def confirm(question: str, *, yes: bool) -> bool:
-    """Ask on the terminal; True at once if it was answered by `--yes`."""
+    """Ask on the terminal; return True without asking if `--yes` was given."""
     if yes:
         return True
     if not sys.stdin.isatty():
         raise FleetError(
-            "no terminal to ask on; give --yes to move or change the robot without a question"
+            "no terminal to ask on; give --yes to move or change the robot without confirmation"
         )
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
@@ -132,10 +132,10 @@ def drives_within_reach(
     *,
     lifted: float = 0.0,
 ) -> Iterator[bool]:
-    """Have the drives there for a while; yields True if the simulator was started for it.
+    """Make the drives accessible; yield True if the simulator was started for this.
 
-    Real drives are there or not; nothing is started for them. A simulator that is started hangs the
-    robot higher by `lifted`, m.
+    Nothing is started for real drives. A simulator that is started hangs the robot higher by
+    `lifted`, m.
     """
     refuse_half_emulated(robot)
     if not is_simulated(robot):
@@ -143,7 +143,7 @@ def drives_within_reach(
         return
     simulator: SupervisedFleet | None = None
     if not is_up(run_dir):
-        # a light foot in the air on a damped drivetrain wants a finer step than a standing robot
+        # a light foot in the air on a damped drivetrain needs a finer step than a standing robot
         words = ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
         alone = FleetOptions(
             overrides={"simulator": words},
@@ -158,16 +158,16 @@ def drives_within_reach(
         if simulator is not None and not simulator.pids():
             log = simulator.run.log_of("simulator")
             tail = "\n".join(log.read_text(encoding="utf-8").splitlines()[-5:])
-            raise FleetError(f"the simulator has ended by itself; its log:\n{tail}")
+            raise FleetError(f"the simulator ended unexpectedly; its log:\n{tail}")
     finally:
         if simulator is not None:
             simulator.stop()
 
 
 def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
-    """Wait until an emulated robot's load cells speak: its buses are there, and its loop runs.
+    """Wait until an emulated robot's load cells send: its buses exist, and its loop runs.
 
-    Not for ever: its simulator may be dead.
+    The wait has a timeout, because the simulator may be dead.
     """
     config = bus_config(robot, robot.harness.bus, RunDir(run_dir).path)
     until = time.monotonic() + seconds
@@ -179,9 +179,9 @@ def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
 
 @contextlib.contextmanager
 def no_fleet_meanwhile(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
-    """Keep a fleet from being started on real drives for a while, in this run directory.
+    """Prevent a fleet from being started on real drives in this run directory.
 
-    A fleet that is up stays; an emulated robot's simulator holds the directory itself.
+    A fleet that is up stays up; an emulated robot's simulator holds the directory itself.
     """
     if is_simulated(robot) or is_up(run_dir):
         yield
@@ -204,14 +204,14 @@ def drives_to_ourselves(
     *,
     lifted: float = 0.0,
 ) -> Iterator[bool]:
-    """Have the drives within reach, and no new fleet on them; yields True as the function above."""
+    """Make the drives accessible and prevent a new fleet; yield as `drives_within_reach`."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(no_fleet_meanwhile(robot, run_dir))
         started = stack.enter_context(
             drives_within_reach(robot, config_path, run_dir, lifted=lifted)
         )
         if started:
-            progress("no fleet is up and the drives are emulated: their simulator runs meanwhile")
+            progress("no fleet is up and the drives are emulated: starting their simulator")
             time.sleep(SETTLE_S)
         if is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
             stack.enter_context(emulated_usb(run_dir))
@@ -222,13 +222,13 @@ def drives_to_ourselves(
 def emulated_usb(run_dir: Path) -> Iterator[None]:
     """Put the emulated drives on this process's USB, before anything imports `odrive`.
 
-    The environment is as it was afterwards; the stand-in stays loaded.
+    The environment is restored afterwards; the stand-in stays loaded.
     """
     with tempfile.TemporaryDirectory(prefix="xrl-usb-") as folder:
         usb_standin.load(usb_standin.build(Path(folder)))
         wanted = {
             usb_standin.VARIABLE: str(RunDir(run_dir).live / usb_standin.FOLDER),
-            # where the package keeps drives' descriptors: not those of emulated ones at home
+            # the package's cache of descriptors: keep emulated drives out of the home directory
             "XDG_CACHE_HOME": str(Path(folder) / "cache"),
         }
         before = {name: os.environ.get(name) for name in wanted}
@@ -247,15 +247,15 @@ def emulated_usb(run_dir: Path) -> Iterator[None]:
 def boards_on_usb(
     robot: RobotConfig, run_dir: Path, modules: Iterable[str]
 ) -> Iterator[FoundBoards]:
-    """Connect to the boards of these modules over USB, or to the emulated ones.
+    """Connect to the boards of these modules over USB, or to the emulated boards.
 
-    Modules without a serial number have none.
+    Modules without a serial number get no board.
     """
     serials = [robot.module_named(module).serial_number for module in modules]
     with contextlib.ExitStack() as stack:
         if is_simulated(robot):
             stack.enter_context(emulated_usb(run_dir))
-        require("usb")  # not before the stand-in is there
+        require("usb")  # only after the stand-in is loaded
         from tools.bringup.usb_board import UsbBus  # noqa: PLC0415
 
         bus = UsbBus()

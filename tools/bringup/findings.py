@@ -1,4 +1,4 @@
-"""The doctor's findings: rows with a verdict and what to do; put together, printed, counted."""
+"""Findings of the doctor: rows with a verdict and a remedy; merged, counted and printed."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class FindingKind(StrEnum):
 
     OK = "ok"
     WARNING = "warning"
-    """The robot may run, and somebody should know."""
+    """The robot may run, but a person should know."""
     WRONG = "wrong"
-    """The robot must not be let down from its hoist like this."""
+    """The robot must not be lowered from its hoist in this state."""
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -39,38 +39,38 @@ class Finding(msgspec.Struct, frozen=True):
     wanted: str
     verdict: FindingKind
     fix: str = ""
-    """What to do about it; commands in backquotes."""
+    """Remedy; commands in backquotes."""
     why: str = ""
-    """What happens otherwise."""
+    """Consequence if it is not fixed."""
 
 
 Groups = dict[str, list[Finding]]
-"""Rows by the heading that they stand under."""
+"""Rows by their heading."""
 WIDE: Final = 110
-"""Columns from which what to do stands beside a finding; else it stands below its table."""
+"""Minimum width for a column of remedies; on a narrower console they follow the table."""
 COLOURS: Final = {
     FindingKind.OK: "green",
     FindingKind.WARNING: "yellow",
     FindingKind.WRONG: "bold red",
 }
 NAME_MAX: Final = 22
-"""Longest name on one line."""
+"""Maximum length of a name on one line."""
 NAMED_MAX: Final = 6
-"""Findings that the last line names."""
+"""Maximum number of findings named in the last line."""
 ALL: Final = "all"
-"""Subject of a row that stands for several alike."""
+"""Subject of a row that merges several equal ones."""
 
 _MODULES: Final = set(MODULES)
 _AXES: Final = {f"{module}.{axis}" for module in MODULES for axis in AXES}
 
 
 def ok(subject: str, what: str, found: str, wanted: str = "") -> Finding:
-    """Return a row that needs nothing."""
+    """Return a row that needs no action."""
     return Finding(subject, what, found, wanted, FindingKind.OK)
 
 
 def warning(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
-    """Return a row that somebody should know of."""
+    """Return a row that a person should know of."""
     return Finding(subject, what, found, wanted, FindingKind.WARNING, fix, why)
 
 
@@ -80,17 +80,17 @@ def wrong(subject: str, what: str, found: str, wanted: str, fix: str, why: str =
 
 
 def judged(good: bool, *row: str) -> Finding:
-    """Return a row that is ok if it is good, else wrong; the row is that of `wrong`."""
+    """Return an ok row if it is good, else a wrong row; `row` has the arguments of `wrong`."""
     return ok(*row[:4]) if good else wrong(*row)
 
 
 def advised(good: bool, *row: str) -> Finding:
-    """Return a row that is ok if it is good, else a warning; the row is that of `warning`."""
+    """Return an ok row if it is good, else a warning; `row` has the arguments of `warning`."""
     return ok(*row[:4]) if good else warning(*row)
 
 
 def merged(rows: Iterable[Finding]) -> list[Finding]:
-    """Return the rows with those on the same matter merged.
+    """Return the rows, with those on the same matter merged.
 
     Rows that are ok become one, from the smallest to the largest value. Rows that are not ok merge
     where all six modules, all twelve axes, or both axes of a module are equal, so boards with
@@ -119,13 +119,13 @@ def merged(rows: Iterable[Finding]) -> list[Finding]:
 
 
 def _anywhere(row: Finding) -> str:
-    """Return what to do about a row, whichever module it is about."""
+    """Return the remedy of a row, with MODULE in place of its module."""
     module = row.subject.partition(".")[0]
     return row.fix.replace(f" --module {module}", "").replace(module, "MODULE")
 
 
 def _one(group: list[Finding], subject: str) -> Finding:
-    """Return the row that stands for rows of one matter: its values from least to largest."""
+    """Return one row for several on the same matter, with the range of their values."""
     first = group[0]
     if len(group) == 1:
         return first
@@ -144,10 +144,10 @@ def _by_number(text: str) -> tuple[float, str]:
 
 
 class Report(msgspec.Struct, frozen=True):
-    """What `xrl doctor --json` prints."""
+    """Output of `xrl doctor --json`."""
 
     ok: bool
-    """Nothing is wrong; there may be warnings."""
+    """True if nothing is wrong; there may be warnings."""
     wrong: int
     warnings: int
     groups: dict[str, list[Finding]]
@@ -161,7 +161,7 @@ def report_of(groups: Groups) -> Report:
 
 
 def show(console: Console, groups: Groups, *, verbose: bool) -> None:
-    """Print the findings, and one line for all of them."""
+    """Print the findings and the verdict in one line."""
     for title, rows in groups.items():
         console.print(_group(title, rows if verbose else merged(rows), console.width))
     report = report_of(groups)
@@ -171,7 +171,7 @@ def show(console: Console, groups: Groups, *, verbose: bool) -> None:
 
 
 def verdict_line(groups: Groups) -> str:
-    """Return "all ok", or how much is wrong and what: the command's answer in a line."""
+    """Return the verdict in one line: "all ok", or the number of findings and their names."""
     report = report_of(groups)
     warnings = report.warnings
     noted = f"{warnings} warning{'s' * (warnings != 1)}: {_names(groups, FindingKind.WARNING)}"
@@ -184,7 +184,7 @@ def verdict_line(groups: Groups) -> str:
 def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("part", no_wrap=True, min_width=12)
-    table.add_column("what", no_wrap=True, min_width=16)
+    table.add_column("check", no_wrap=True, min_width=16)
     table.add_column("found", overflow="fold")
     table.add_column("wanted", overflow="fold")
     table.add_column("", no_wrap=True, min_width=max(len(row.verdict) for row in rows))
@@ -208,7 +208,7 @@ def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
 
 
 def _names(groups: Groups, verdict: FindingKind) -> str:
-    """Return the first of the rows with a verdict, and how many more lines there are."""
+    """Return the names of the first rows with a verdict, and the number of further rows."""
     rows = [row for group in groups.values() for row in merged(group) if row.verdict is verdict]
     names = [
         # the last part of a setting's name

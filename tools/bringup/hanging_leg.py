@@ -1,7 +1,7 @@
-"""A leg that hangs: its joints' inertia and gravity, and which poses gravity explains. Pure.
+"""Model of a hanging leg: inertia and gravity of its joints, and poses that gravity explains. Pure.
 
-Written for the robot file's two equal masses of a leg, at knee and ankle; the hip's module is on
-the torso, and an ankle's mass lies in its axis.
+It assumes the robot file's two equal masses of a leg, at knee and ankle. The hip's module is on the
+torso, and an ankle's mass lies on its axis.
 """
 
 from __future__ import annotations
@@ -21,31 +21,32 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULE_INDEX, MODULES, N_JOINTS, side_of
 
 INSIDE: Final = 0.12
-"""rad inside its limits that a joint is led to: room for the motion."""
+"""Distance inside its limits to which a joint is moved, as room for the motion, rad."""
 HEAVY: Final = 1.0
-"""kg m^2; with more on it a joint that is shaken quickly shakes the hoist."""
+"""Inertia above which a joint that moves quickly shakes the hoist, kg m^2."""
 RESTS_FROM: Final = 15.0
-"""N m on a limp hip; 9 where the emulated robot hangs free, 22 where its soles are on the floor."""
+"""Torque on a limp hip from which its leg rests on something, N m. The emulated robot has 9 if it
+hangs free, and 22 if its soles are on the floor."""
 BIAS_TORQUE: Final = 1.3
-"""Times what gravity takes at the bias, by the robot file."""
+"""Factor on the gravity torque at the bias, by the robot file."""
 
 FRICTION: Final = 1.0
-"""N m of dry friction and cogging that may hold a joint off its balance; the simulated robot has
-0.5. The thigh is short: a newton metre at hip and knee holds a knee 0.055 rad off."""
+"""Maximum dry friction and cogging that hold a joint off its balance, N m; the simulated robot has
+0.5. The thigh is short: 1 N m at hip and knee holds a knee 0.055 rad off."""
 KNEE_ERROR: Final = 0.03
-"""rad by which a knee hangs otherwise than by the robot file: 8 mm of its module's centre."""
+"""Maximum error of a hanging knee's angle by the robot file, rad: 8 mm of its module's centre."""
 HIP_ERROR: Final = 0.02
-"""rad by which a leg's centre of mass is not where the file has it."""
+"""Maximum error of the direction of a leg's centre of mass by the robot file, rad."""
 BEYOND: Final = 0.25
-"""rad beyond its limits that a joint may be found: they are where the software's stops begin."""
+"""Maximum distance of a joint beyond its limits, rad: the software's stops begin at the limits."""
 STOP_FROM: Final = 0.05
-"""rad inside its limit from which a joint may rest on a mechanical stop."""
+"""Distance inside its limit from which a joint may rest on a mechanical stop, rad."""
 TILT_MAX: Final = 0.35
-"""rad; a torso that hangs tilts no farther."""
+"""Maximum tilt of a hanging torso, rad."""
 FOLDED: Final = 1.0
-"""rad; the thigh of a leg that hangs points down so far at least."""
+"""Maximum angle of a hanging leg's thigh from the vertical, rad."""
 SWUNG: Final = 0.04
-"""rad to either side of its rest that a joint has to swing: a few times its friction's band."""
+"""Minimum swing of a joint to either side of its rest, rad: a few times its friction band."""
 
 
 def leg_of(*modules: str) -> tuple[str, ...]:
@@ -55,45 +56,45 @@ def leg_of(*modules: str) -> tuple[str, ...]:
 
 
 def why_resting(robot: RobotConfig, q: Mapping[str, Pair]) -> str:
-    """Return why a leg does not hang free at q, rad; "" if it may.
+    """Return why a leg does not hang free at q, rad; "" if it may hang free.
 
     A limp joint that gravity would move rests on something.
 
     Args:
-        robot: its file.
-        q: of the leg's three modules.
+        robot: robot file.
+        q: angles of the leg's three modules.
     """
     tau = HangingLegs(robot).torque(_angles(q))
     for name, (_, theta) in q.items():
         torque = tau[2 * MODULE_INDEX[name] + 1]
         if name.startswith("hip") and abs(torque) > RESTS_FROM:
             return (
-                f"{name} is limp at theta {theta:.2f} rad, where its leg weighs {abs(torque):.0f} "
-                "N m on it: it rests on something"
+                f"{name} is limp at theta {theta:.2f} rad, where its leg loads it with "
+                f"{abs(torque):.0f} N m: the leg rests on something"
             )
     return ""
 
 
 class HangingJoint(NamedTuple):
-    """A joint of a leg that hangs, by the robot file."""
+    """Joint of a hanging leg, by the robot file."""
 
     inertia: float
-    """Inertia of what hangs on it, without its rotor, kg m^2."""
+    """Inertia of the parts that hang on it, without its rotor, kg m^2."""
     gravity: float
     """Stiffness that gravity gives it, N m/rad."""
     bias: Pair
-    """How far its module must be led to be well inside its limits, (phi, theta), rad."""
+    """Offset that brings its module well inside its limits, (phi, theta), rad."""
 
     @property
     def held_torque(self) -> float:
-        """What holds the leg at its bias, N m."""
+        """Torque that holds the leg at its bias, N m."""
         return BIAS_TORQUE * self.gravity * sum(map(abs, self.bias))
 
 
 def hanging_joint(
     robot: RobotConfig, q: Mapping[str, Pair], module: str, axis: int
 ) -> HangingJoint:
-    """Return what the robot file says of a joint of a leg that hangs at q, rad."""
+    """Return a joint of a leg that hangs at q, rad, by the robot file."""
     legs, at = HangingLegs(robot), _angles(q)
     joint, by = 2 * MODULE_INDEX[module] + axis, np.zeros(N_JOINTS)
     by[joint] = 1e-4
@@ -107,7 +108,7 @@ def hanging_joint(
 
 
 def _angles(q: Mapping[str, Pair]) -> NDArray[np.float64]:
-    """Return joint angles (12,), rad, 0 where a module is not there."""
+    """Return joint angles (12,), rad, with 0 for missing modules."""
     at = np.zeros(N_JOINTS)
     for name, pair in q.items():
         index = 2 * MODULE_INDEX[name]
@@ -116,26 +117,26 @@ def _angles(q: Mapping[str, Pair]) -> NDArray[np.float64]:
 
 
 class Upright(NamedTuple):
-    """Which way is up, torso axes."""
+    """Direction of up, torso axes."""
 
     up: Vector3
     within: float
-    """How well it is known, rad; inf: not at all."""
+    """Maximum error, rad; inf if the direction is unknown."""
 
     @property
     def is_known(self) -> bool:
-        """True if it is known at all."""
+        """True if the direction is known."""
         return math.isfinite(self.within)
 
 
 def leg_scores(robot: RobotConfig, q_knee: Array, q_hip: Array, upright: Upright) -> Array:
-    """Return how far gravity speaks against each pose of a leg (n, m): 1 is explained.
+    """Return how much gravity contradicts each pose of a leg (n, m); up to 1 it explains the pose.
 
     Args:
         robot: masses, lengths and limits.
         q_knee: (n, 2) phi and theta of its knee, rad.
-        q_hip: (m, 2) of its hip.
-        upright: which way is up; where that is not known, a torso that hangs.
+        q_hip: (m, 2) phi and theta of its hip, rad.
+        upright: direction of up; if it is unknown, the torso is assumed to hang.
     """
     allowed = TILT_MAX
     if upright.is_known:
@@ -146,7 +147,7 @@ def leg_scores(robot: RobotConfig, q_knee: Array, q_hip: Array, upright: Upright
 
 
 def implied_up(robot: RobotConfig, q_knee: Array, q_hip: Array) -> Array:
-    """Return which way is up, torso axes (n, m, 3), if a leg's centre of mass is below its hip."""
+    """Return the direction of up, torso axes (n, m, 3): a leg's centre of mass is below its hip."""
     up: Array = -np.einsum("hij,kj->khi", rotations(q_hip), _leg_down(robot, q_knee))
     return up
 
@@ -158,7 +159,7 @@ def angle(vectors: Array, other: Array) -> Array:
 
 
 def not_swung(swing: tuple[Pair, Pair], *, knee: bool) -> str:
-    """Return which way a joint has not swung; a knee may hang on its stop; "" if it has."""
+    """Return a direction in which a joint has not swung, or ""; a knee may hang on its stop."""
     (phi_low, theta_low), (phi_high, theta_high) = swing
     sides = {
         "phi, to its left": phi_low <= -SWUNG,
@@ -179,9 +180,9 @@ def rotations(q: Array) -> Array:
 
 
 def _knee_scores(robot: RobotConfig, q: Array) -> Array:
-    """Score knees (n, 2) by the torque that friction or a stop has to hold: 1 is explained.
+    """Score knees (n, 2) by the torque that friction or a stop must hold; up to 1 is explained.
 
-    The thigh gives way as the knee bends, so that a third of the knee's angle is left to the shin.
+    The thigh swings as the knee bends, so a third of the knee's angle remains for the shin.
     """
     down = _leg_down(robot, q)
     l1, l2 = robot.geometry.l1, robot.geometry.l2
@@ -202,13 +203,13 @@ def _knee_scores(robot: RobotConfig, q: Array) -> Array:
 
 
 def _weight(robot: RobotConfig) -> float:
-    """Return what a hanging leg's balance at its hip is worth, N m/rad."""
+    """Return the stiffness that gravity gives a hanging leg at its hip, N m/rad."""
     l1, l2 = robot.geometry.l1, robot.geometry.l2
     return robot.mass.module * GRAVITY * (2.0 * l1 + l2)
 
 
 def _leg_down(robot: RobotConfig, q_knee: Array) -> Array:
-    """Return down in thigh axes (n, 3) for a leg that hangs from its hip with these knees (n, 2).
+    """Return down in thigh axes (n, 3) for a leg that hangs from its hip, by its knee (n, 2).
 
     Two equal masses, a module at the knee and one at the ankle; the hip's is on the torso.
     """

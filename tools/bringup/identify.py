@@ -6,13 +6,13 @@ its Fourier series gives rate and acceleration without a filter's lag, and
     tau = I q'' + d q' + c sign(q') + k (q - q_0) + tau_0
 
 is linear in inertia I, viscous friction d, dry friction c, gravity's stiffness k and tau_0; two
-frequencies tell I and k apart. I holds rotor and leg: what hangs on the joint is taken off by the
-masses of the robot file, and so is known to a few percent of itself only. At an ankle that is a
-foot, at a knee or hip it is fifty times the rotor.
+frequencies separate I from k. I includes rotor and leg. The leg's part is subtracted by the masses
+of the robot file, which are known only to a few percent. At an ankle the leg's part is a foot; at a
+knee or hip it is fifty times the rotor.
 
-A drive holds a target for a period, so its torque is a saw tooth. What counts is its mean about a
-sample: half of the old target's torque and half of the new one's, if the new one came at once
-(lockstep), and more of the old one's the later it comes (over CAN some 1 ms).
+A drive holds a target for a period, so its torque is a saw tooth. The fit uses its mean about a
+sample: half of the old target's torque and half of the new one's if the new target arrives at once
+(lockstep), and more of the old one's the later the new target arrives (over CAN about 1 ms).
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from tools.bringup.hanging_leg import HEAVY, HangingJoint
 from tools.bringup.motion import MotionPlan, Sample
 
 TONES: Final = ((0.4, 5), (1.0, 8), (2.0, 12))
-"""Hz and cycles of each tone; the first cycle and the last swell and fade, and are not used."""
+"""Hz and cycles of each tone; the first and last cycles fade in and out, and are not used."""
 HEAVY_TONES: Final = ((0.2, 5), (0.5, 8))
 AMPLITUDE_MAX: Final = 0.06
-"""rad; the lowest tone, where nothing else limits it."""
+"""Maximum amplitude, rad; the lowest tone reaches it if nothing else limits it."""
 TORQUE_SHARE: Final = 0.4
 """Fraction of the torque limit that a tone may need for inertia and gravity."""
 K_P: Final = (400.0, 3000.0)
-"""N m/rad, for light joints and heavy ones: soft, since a sample's time error shows as k_p times
-itself in the viscous friction."""
+"""Limits of k_p, N m/rad, for light and heavy joints. They are soft, because a sample's time error
+adds k_p times itself to the viscous friction."""
 K_D: Final = (8.0, 35.0)
-"""N m s/rad"""
+"""Limits of k_d, N m s/rad."""
 PER_INERTIA: Final = (1600.0, 50.0)
-"""k_p and k_d of a joint by its inertia: 40 rad/s."""
+"""k_p and k_d per inertia of a joint: 40 rad/s."""
 AFTER: Final = 0.25
-"""Share of the new target's torque: as if it came 0.5 ms after the sample."""
+"""Share of the new target's torque: as if it arrived 0.5 ms after the sample."""
 TIME_SD: Final = 5e-4
-"""s; how well that is known."""
+"""Standard deviation of that time, s."""
 YIELDS: Final = 0.05
-"""Share of an inertia that is uncertain: leg and hoist, on the joint's other side, give way."""
+"""Uncertain fraction of an inertia: leg and hoist, on the joint's other side, yield."""
 DRY_SD: Final = 0.04
-"""N m; cogging and play show as dry friction of this size."""
+"""Standard deviation of dry friction, N m, caused by cogging and play."""
 MASS_SD: Final = 0.03
-"""Fraction of the leg's inertia in the robot file."""
+"""Standard deviation of the leg's inertia in the robot file, as a fraction of it."""
 HALF_WIDTH: Final = 1.96
-"""Standard deviations on either side: 95 %."""
+"""Half the width of the 95 % interval, standard deviations."""
 HARMONICS: Final = 9
 MOVING: Final = 0.3
 """Fraction of a tone's fastest rate; slower samples, where a joint sticks, are not used."""
@@ -70,11 +70,11 @@ class _Tone(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """How long it takes, s."""
+        """Duration, s."""
         return self.cycles / self.frequency_hz
 
     def offset(self, t_s: float) -> tuple[float, float]:
-        """Return the sine, rad, and its rate, rad/s, at a time since its begin."""
+        """Return the sine, rad, and its rate, rad/s, at a time since its start, s."""
         omega = 2.0 * math.pi * self.frequency_hz
         inside = min(1.0, t_s * self.frequency_hz, (self.duration_s - t_s) * self.frequency_hz)
         sign = 1.0 if t_s < 0.5 * self.duration_s else -1.0
@@ -107,7 +107,7 @@ class _Tones(NamedTuple):
 
     @property
     def rate_max(self) -> float:
-        """Fastest rate that it asks for, rad/s."""
+        """Maximum requested rate, rad/s."""
         return max(2.0 * math.pi * tone.frequency_hz * tone.amplitude for tone in self.tones)
 
     def at(self, t_s: float) -> Pair:
@@ -130,7 +130,7 @@ SinePlan = MotionPlan[_Tones]
 
 
 class _JointFit(NamedTuple):
-    """What the sines show; each a value and its standard deviation."""
+    """Results of the sines, each a value and its standard deviation."""
 
     inertia: tuple[float, float]
     """Rotor and leg, kg m^2."""
@@ -139,13 +139,13 @@ class _JointFit(NamedTuple):
     dry: tuple[float, float]
     """N m"""
     stiffness: tuple[float, float]
-    """Gravity's, N m/rad."""
+    """Stiffness from gravity, N m/rad."""
 
 
 def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> SinePlan:
-    """Return sines that need a part of a torque, N m, of a joint led inside its limits first.
+    """Return sines that need a part of a torque, N m, for a joint first moved inside its limits.
 
-    What holds the leg at its bias comes on top.
+    The torque that holds the leg at its bias is added.
     """
     inertia, gravity = joint.inertia + armature, joint.gravity
     tones = []
@@ -155,13 +155,13 @@ def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> 
         tones.append(_Tone(hertz, float(min(AMPLITUDE_MAX, most)), cycles))
     k_p = min(max(PER_INERTIA[0] * inertia, K_P[0]), K_P[1])
     k_d = min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1])
-    # alike for both axes: both motors' own loops then do all of it
+    # equal for both axes, so that both motors' own loops do all of it
     soft = ((k_p, k_p), (k_d, k_d))
     return SinePlan(axis, _Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
 
 
 def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> _JointFit | None:
-    """Return what steady samples of a whole motion show; None if there are too few."""
+    """Fit the steady samples of a whole motion; return None if there are too few."""
     parts = []
     for along_s, tone in plan.course.begins():
         begin_s = plan.rest_s + along_s
@@ -198,8 +198,8 @@ def _steady(
 ) -> tuple[Array, Array, Array, Array]:
     """Return regressors (n, 5), torque (n,), cycle and weight of a tone's steady part.
 
-    A sample weighs as the way that it stands for: cogging slows a joint where it opposes, and to
-    count by time would take it for friction.
+    A sample is weighted by the distance it stands for. Cogging slows a joint where it opposes the
+    motion, so weighting by time would count cogging as friction.
     """
     t = np.array([s.t_s - begin_s for s in samples])
     q = np.array([s.q[axis] for s in samples])
@@ -224,17 +224,17 @@ def _steady(
 
 
 Verdict = Literal["change", "agrees", "measured", "not shown"]
-"""The robot file's value lies outside the interval, or inside; the file has no such value; the
-interval is too wide to say anything."""
+"""Respectively: the robot file's value is outside the interval; it is inside; the file has no such
+value; the interval is too wide for a verdict."""
 
 
 class Estimate(NamedTuple):
-    """One number of a joint."""
+    """Estimate of one quantity of a joint."""
 
     what: str
     unit: str
     file: float | None
-    """Value of the robot file; None if it has none."""
+    """Value of the robot file, or None."""
     value: float
     half_width: float
     """Half the width of the 95 % interval."""
@@ -251,18 +251,18 @@ class Estimate(NamedTuple):
 
 
 class JointResult(NamedTuple):
-    """What the sines of one joint showed."""
+    """Results of one joint's sines."""
 
     joint: str
     fit: _JointFit
     leg_inertia: float
-    """Inertia of what hangs on it by the robot file, without its rotor, kg m^2."""
+    """Inertia of the parts that hang on it, by the robot file, without its rotor, kg m^2."""
 
 
 def estimates_of(results: Sequence[JointResult], robot: RobotConfig) -> list[Estimate]:
-    """Return what the sines say; the last row is the rotors' inertia, one for all joints.
+    """Return the estimates; the last row is the rotors' inertia, one value for all joints.
 
-    It is not shown if its interval is wider than half of the robot file's value.
+    Its verdict is "not shown" if half its interval is wider than half of the robot file's value.
     """
     armature, rows, rotors = robot.joint.armature, [], []
     for joint, fit, leg_inertia in results:

@@ -1,8 +1,8 @@
-"""Moving one axis of one module a little and back, by the drive's own loop: plan, limits, guards.
+"""Small motion of one axis and back, by the drive's own loop: plan, limits and guards. Pure.
 
 Law, torque limiter and drive targets are the joint service's, so a sign that is right here is right
-there. Only the force differs: the drive's own current limit keeps every motor below the requested
-torque, whatever happens to this process. Pure; `motion_runner` has the clock and the drives.
+there. Only the torque differs: the drive's own current limit keeps every motor below the requested
+torque, whatever happens to this process. `motion_runner` has the clock and the drives.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from shared.joints import AXES, KINDS
 from shared.robot.robot_model import HARD_STOP_MARGIN
 
 SETTLE_S: Final = 0.7
-"""Held where it is before it moves, and again afterwards."""
+"""Time for which the joint is held before the motion, and again afterwards, s."""
 BIAS_S: Final = 2.0
-"""Time in which a module is led to the place that it moves about, s."""
+"""Duration of the motion to the bias, s."""
 VEL_LIMIT: Final = 3.0
-"""turn/s at the motor, at least; a drive that is faster disarms by itself (OVERSPEED)."""
+"""Minimum speed limit of the motor, turn/s; a drive beyond its limit disarms (OVERSPEED)."""
 VEL_FACTOR: Final = 5.0
-"""Factor on the fastest requested rate, where that is more."""
+"""Factor on the maximum requested rate, if that gives a higher speed limit."""
 APART_MAX: Final = 0.15
-"""rad between reference and joint: no friction explains it."""
+"""Maximum distance between reference and joint, rad: friction cannot explain more."""
 OVER_TORQUE: Final = 0.98
 """Fraction of the torque limit, in the sum of both axes, that counts as at the limit."""
 OVER_TORQUE_S: Final = 0.2
 SILENT_S: Final = 0.2
-"""Without a sample for so long, nobody knows where the joint is."""
+"""Timeout without a sample, s: the joint's position is then unknown."""
 STRAYED_MAX: Final = 0.05
-"""rad that a limp joint may have moved between the look and the arming."""
+"""Maximum motion of a limp joint between the check and the arming, rad."""
 STOP_ROOM: Final = 0.02
-"""rad beyond a stop: zero errors of the encoders, and a stop that gives way."""
+"""Allowance beyond a stop, rad: zero errors of the encoders, and a stop that yields."""
 
 
 class AxisCourse(Protocol):
-    """A motion of one axis about a place, from which it starts and where it ends."""
+    """Motion of one axis about a position, where it starts and ends."""
 
     @property
     def duration_s(self) -> float:
-        """How long it takes."""
+        """Duration, s."""
 
     @property
     def span(self) -> Pair:
@@ -57,14 +57,14 @@ class AxisCourse(Protocol):
 
     @property
     def rate_max(self) -> float:
-        """Fastest rate that it asks for, rad/s."""
+        """Maximum requested rate, rad/s."""
 
     def at(self, t_s: float) -> Pair:
         """Return offset, rad, and rate, rad/s, at a time within its duration."""
 
 
 class Stay:
-    """No motion, for as long as it takes: of a module that is held."""
+    """No motion, without end, for a module that is held."""
 
     duration_s: float = math.inf
     span: Pair = pd_law.ZERO
@@ -79,7 +79,7 @@ C = TypeVar("C", bound=AxisCourse)
 
 
 class MotionPlan(NamedTuple, Generic[C]):
-    """A course of one axis about where the joint is found, or about a bias from there."""
+    """Course of one axis about the joint's present position, or about a bias from it."""
 
     axis: int
     """0: phi, 1: theta."""
@@ -87,23 +87,23 @@ class MotionPlan(NamedTuple, Generic[C]):
     torque_limit: float
     """N m at the joint: |tau_phi| + |tau_theta|."""
     bias: Pair = pd_law.ZERO
-    """Where the module is led first, and back from, rad: a knee hangs straight, on its stop."""
+    """Offset to which the module is moved first, rad: a straight hanging knee is on its stop."""
     own_gains: tuple[Pair, Pair] | None = None
-    """k_p, N m/rad, and k_d, N m s/rad, of (phi, theta); None: the module's stand gains."""
+    """k_p, N m/rad, and k_d, N m s/rad, of (phi, theta); None for the module's stand gains."""
 
     @property
     def rest_s(self) -> float:
-        """Time before the course and after it, s, with the way to the bias."""
+        """Time before and after the course, including the motion to the bias, s."""
         return SETTLE_S + (BIAS_S + SETTLE_S if any(self.bias) else 0.0)
 
     @property
     def duration_s(self) -> float:
-        """How long the whole takes."""
+        """Duration of the whole motion, s."""
         return 2.0 * self.rest_s + self.course.duration_s
 
     @property
     def reach(self) -> tuple[Pair, Pair]:
-        """Lowest and highest offset that phi, and that theta, is led to, rad."""
+        """Lowest and highest offsets of phi, and of theta, rad."""
         phi, theta = (
             (self.bias[axis] + low, self.bias[axis] + high)
             for axis in (0, 1)
@@ -115,7 +115,7 @@ class MotionPlan(NamedTuple, Generic[C]):
         """Return the offsets of (phi, theta), rad, and their rates, rad/s, at a time.
 
         Args:
-            t_s: since the drive was armed.
+            t_s: time since the drive was armed, s.
         """
         left_s, along_s = self.duration_s - t_s, t_s - self.rest_s
         inside = 0.0 <= along_s <= self.course.duration_s
@@ -135,16 +135,16 @@ AnyPlan = MotionPlan[Any]
 
 
 class Sample(NamedTuple):
-    """One cycle."""
+    """Sample of one cycle."""
 
     t_s: float
-    """Since the drive was armed."""
+    """Time since the drive was armed, s."""
     q_ref: Pair
     q: Pair
     tau: Pair
     """Requested torque at this sample, N m at the joint."""
     tau_before: Pair = pd_law.ZERO
-    """Torque at this sample by the target before it, which the drive had up to now."""
+    """Torque at this sample by the previous target, which the drive had until now, N m."""
 
 
 def limit_drives(robot: RobotConfig, plan: AnyPlan) -> RobotConfig:
@@ -153,15 +153,15 @@ def limit_drives(robot: RobotConfig, plan: AnyPlan) -> RobotConfig:
     A motor's torque is at most T / 2N, so that |tau_phi| + |tau_theta| <= T in the drive.
 
     Raises:
-        DriveError: the torque limit is beyond the robot's, or too small to be set.
+        DriveError: the torque limit exceeds the robot's, or is too small to be set.
     """
     drive, joint = robot.drive, robot.joint
     per_ampere = 2.0 * joint.gear_ratio * drive.torque_constant
     most = min(joint.tau_module_max, drive.current_lim * per_ampere)
     if not per_ampere <= plan.torque_limit <= most:
         raise DriveError(
-            f"--torque-limit {plan.torque_limit:g}: {per_ampere:.1f} .. {most:.1f} N m are right "
-            "(one ampere, and what the robot file allows)"
+            f"--torque-limit {plan.torque_limit:g}: must be {per_ampere:.1f} to {most:.1f} N m "
+            "(from one ampere to the limit of the robot file)"
         )
     asked = plan.course.rate_max * joint.gear_ratio / (2.0 * math.pi)
     speed = min(drive.vel_limit, max(VEL_LIMIT, VEL_FACTOR * asked))
@@ -182,46 +182,46 @@ def within_stops(robot: RobotConfig) -> RobotConfig:
 
 
 def why_out_of_reach(robot: RobotConfig, module: str, plan: AnyPlan, q: Pair) -> str:
-    """Return why the joint may not go where the plan leads it from q, rad; "" if it may."""
+    """Return why the plan must not move the joint from q, rad, or ""."""
     limits = limits_of(robot, module)
     for axis, (low, high) in enumerate((limits.phi, limits.theta)):
         if not low <= q[axis] <= high:  # so that a NaN is outside
             return (
-                f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} .. {high:g} rad; bring "
-                "it inside by hand, or correct its zero (`xrl drive zero`)"
+                f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} to {high:g} rad; move "
+                "it inside by hand, or correct its zero with `xrl drive zero`"
             )
         ends = [q[axis] + offset for offset in plan.reach[axis]]
         beyond = [end for end in ends if not low <= end <= high]
         if beyond:
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad and would go to {beyond[0]:.3f}, outside of "
-                f"{low:g} .. {high:g} rad; move it the other way (a jog: --by with the other "
-                "sign), or bring the joint elsewhere by hand"
+                f"{low:g} to {high:g} rad; move it the other way (jog: --by with the other sign), "
+                "or first move the joint by hand"
             )
     return ""
 
 
 def why_strayed(q: Pair, q_seen: Pair) -> str:
-    """Return what to say of a joint that is elsewhere than it was seen; "" if it is not."""
+    """Return how far a joint has moved since it was checked; "" if it has not."""
     strayed = max(abs(q[0] - q_seen[0]), abs(q[1] - q_seen[1]))
     if strayed <= STRAYED_MAX:
         return ""
-    return f"the joint has moved by {strayed:.3f} rad before it was armed"
+    return f"the joint moved by {strayed:.3f} rad before it was armed"
 
 
 class GuardedMotion:
-    """The law of one motion and its state, cycle by cycle.
+    """Law of one motion and its state, cycle by cycle.
 
     Attributes:
-        trouble: why it was stopped; "" if it was not.
-        done: the motion is over.
-        samples: recorded so far.
+        trouble: why the motion was stopped; "" if it was not.
+        done: True if the motion is over.
+        samples: samples so far.
     """
 
     def __init__(
         self, robot: RobotConfig, module: str, plan: AnyPlan, q: Pair, now_ns: int
     ) -> None:
-        """Begin at q, rad, with a drive that has just been armed; robot: as of `limit_drives`."""
+        """Start at q, rad, with a drive that was just armed; `robot` is from `limit_drives`."""
         stand = robot.stand_gains(module)
         self._k_p, self._k_d = plan.own_gains or (stand.k_p, stand.k_d)
         limits = limits_of(robot, module)
@@ -241,16 +241,16 @@ class GuardedMotion:
         self.samples: list[Sample] = []
 
     def step(self, now_ns: int, reading: DriveReading | None) -> MotorTarget | None:
-        """Return the drive's next target; None to leave it as it is, or to idle it.
+        """Return the drive's next target; None to keep the last one, or to idle the drive.
 
         Args:
             now_ns: monotonic time.
-            reading: the newest sample, counted from the joint's zero; None if none came.
+            reading: the newest sample, counted from the joint's zero; None without a new sample.
         """
         t_s = (now_ns - self._start_ns) / NS_PER_S
         if reading is None:
             if now_ns - self._received_ns > SILENT_S * NS_PER_S:
-                self.trouble = f"no sample of the drive for {SILENT_S:g} s"
+                self.trouble = f"no sample from the drive for {SILENT_S:g} s"
             return None
         self._received_ns = now_ns
         if reading.status is not DriveStatus.ARMED:
@@ -276,12 +276,12 @@ class GuardedMotion:
         return self._onboard.target(self._gains, now_ns, setpoint, self._tau, pos, vel)
 
     def _why_stop(self, t_s: float, q_ref: Pair, q: Pair) -> str:
-        """Return what speaks against going on; "" if nothing does."""
+        """Return why the motion must stop, or ""."""
         for axis in (0, 1):
             if not abs(q[axis] - q_ref[axis]) <= APART_MAX:
                 return (
-                    f"{AXES[axis]} is at {q[axis]:.3f} rad where {q_ref[axis]:.3f} was asked: "
-                    f"more than {APART_MAX:g} rad apart"
+                    f"{AXES[axis]} is at {q[axis]:.3f} rad, but its reference is "
+                    f"{q_ref[axis]:.3f}: more than {APART_MAX:g} rad apart"
                 )
         limit = self._limits.tau_module_max
         if abs(self._tau[0]) + abs(self._tau[1]) < OVER_TORQUE * limit:
@@ -291,6 +291,6 @@ class GuardedMotion:
         elif t_s - self._at_limit_s > OVER_TORQUE_S:
             return (
                 f"at the torque limit of {limit:g} N m for {OVER_TORQUE_S:g} s: something is in "
-                "the way, or the load needs more (--torque-limit)"
+                "the way, or the load needs a higher --torque-limit"
             )
         return ""

@@ -1,8 +1,8 @@
-"""The one runner of motions: look, ask, arm, hold some, move one, and idle all, whatever happens.
+"""Runs a motion: checks, asks, arms, holds some modules, moves one, and always idles all.
 
-A drive keeps a motion's small limits until a service arms it or it restarts. `xrl doctor` would
-find them wrong, and `xrl drive configure --apply` would restart the board: it loses its zero. So
-the limits are given back at the end.
+A drive keeps a motion's small limits until a service arms it or it restarts. Until then, `xrl
+doctor` would report them as wrong, and `xrl drive configure --apply` would restart the board, which
+loses its zero. So the limits are restored at the end.
 """
 
 from __future__ import annotations
@@ -51,26 +51,26 @@ from tools.flags import MotionFlags
 from tools.terminal import Console, marked
 
 ANSWER_S: Final = 3.0
-"""Longest wait for a drive's first words: its link, and a heartbeat of both axes."""
-NO_ANSWER: Final = "its drive does not answer; look at its power and its bus (`xrl doctor`)"
+"""Timeout for a drive's first answer, s: its link, and a heartbeat of both axes."""
+NO_ANSWER: Final = "its drive does not answer; check its power and its bus (`xrl doctor`)"
 ARM_TRIES: Final = 3
 ARM_S: Final = 0.7
-"""Wait for closed loop after each attempt."""
+"""Wait for closed loop after each attempt, s."""
 IDLE_TRIES: Final = 10
 IDLE_AT_LEAST: Final = 3
-"""Times that idle is said in any case: `Drive` does not tell of one axis that missed it."""
+"""Minimum number of idle commands: `Drive` does not report that one axis missed a command."""
 IDLE_S: Final = 0.2
-"""Wait for heartbeats after each time."""
+"""Wait for heartbeats after each command, s."""
 NOT_IDLE: Final = (
-    "the drive does not say that it is idle: it may still hold; CUT ITS POWER before anybody "
+    "the drive does not report that it is idle: it may still hold; CUT ITS POWER before anybody "
     "touches the joint"
 )
 READ_S: Final = 0.02
 PROGRESS_S: Final = 0.25
 OVERTIME_S: Final = 5.0
-"""Beyond a plan's duration; then the drive's samples come too seldom."""
+"""Maximum time beyond a plan's duration, s; after it, the drive's samples are too rare."""
 STILL: Final = 0.004
-"""rad that a leg which hangs still moves in `STILL_FOR_S`; an idle drive may report no rate."""
+"""Maximum motion of a still leg in `STILL_FOR_S`, rad; an idle drive may report no rate."""
 STILL_FOR_S: Final = 1.5
 """More than half a swing of the leg."""
 STILL_WAIT_S: Final = 60.0
@@ -79,27 +79,27 @@ Clock = Callable[[], int]
 Progress = Callable[[Sample], None]
 
 LIFTED: Final = 0.2
-"""m; the emulated robot is hung this much higher for a leg's motion, feet clear of the floor."""
+"""Extra height of the hung emulated robot for a leg's motion, feet clear of the floor, m."""
 LIMITS_TIMES: Final = 3
-"""CAN of firmware 0.5 does not tell its limits, and a frame may be lost."""
+"""Times that limits are sent: CAN of firmware 0.5 cannot read them, and a frame may be lost."""
 _APART_S: Final = 0.02
 
 
 class MotionResult(NamedTuple):
-    """How a motion ended."""
+    """Result of a motion."""
 
     samples: list[Sample]
     trouble: str
-    """Why it was stopped; "" if it came to its end."""
+    """Why it was stopped; "" if it was completed."""
     not_idle: tuple[str, ...]
-    """Modules whose drives do not say that they are idle."""
+    """Modules whose drives do not report that they are idle."""
 
 
 class Interrupts:
-    """Signals that ask to stop, kept until the drives are idle.
+    """Signals that request a stop, deferred until the drives are idle.
 
     Attributes:
-        number: of the first that came; 0: none.
+        number: the first signal that arrived, or 0.
     """
 
     def __init__(self) -> None:
@@ -107,12 +107,12 @@ class Interrupts:
 
     @property
     def words(self) -> str:
-        """Why they stop a motion; "" without one."""
+        """Reason for stopping a motion; "" without a signal."""
         return f"stopped by {signal.Signals(self.number).name}" if self.number else ""
 
     @contextlib.contextmanager
     def kept(self) -> Iterator[None]:
-        """Keep them while in here."""
+        """Defer signals inside the block."""
         numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
         before = {number: signal.signal(number, self._keep) for number in numbers}
         try:
@@ -126,7 +126,7 @@ class Interrupts:
 
 
 def await_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading | None:
-    """Return a drive's first reading that is not of a lost one; None if it does not answer."""
+    """Return a drive's first reading that is not of a lost drive; None if it does not answer."""
     until = clock() + _ns(ANSWER_S)
     reading = drive.read(READ_S)
     while reading is None or reading.status in LOST_DRIVE:
@@ -142,7 +142,7 @@ def _idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
     if reading is None:
         raise DriveError(NO_ANSWER)
     if reading.status is DriveStatus.UNZEROED:
-        raise DriveError("its drive does not know where the joint is; `xrl drive zero` first")
+        raise DriveError("its drive does not know where the joint is; run `xrl drive zero` first")
     if reading.status is DriveStatus.ARMED:
         raise DriveError("its drive is armed (closed loop) by another program; make it idle first")
     return reading
@@ -156,7 +156,7 @@ def hanging_angles(
     *,
     until_still: bool = True,
 ) -> dict[str, Pair] | None:
-    """Return where modules are, (phi, theta), rad, once they hang still; None if interrupted."""
+    """Return modules' angles, (phi, theta), rad, once they hang still; None if interrupted."""
     begin = still_since = clock()
     rest: dict[str, Pair] = {}
     while True:
@@ -190,18 +190,18 @@ def run_motion(
     progress: Progress,
     clock: Clock = now_ns,
 ) -> MotionResult:
-    """Hold all modules but one where they are, move that one, and idle all, whatever happens.
+    """Hold all modules but one where they are, move that one, and always idle all.
 
     A held module that moves, or whose drive faults, stops the motion.
 
     Args:
         drives: idle, opened with the limits of `limit_drives`.
         robot: as `limit_drives` made it.
-        module: that is moved.
+        module: the one to move.
         plan: its motion.
         q_seen: its angles when the person agreed, rad.
         interrupts: read in every cycle.
-        progress: receives a sample now and then.
+        progress: receives a sample from time to time.
         clock: monotonic, ns.
     """
     hold = MotionPlan(0, Stay(), plan.torque_limit)
@@ -227,7 +227,7 @@ def run_motion(
 
 
 class _GuardedModule:
-    """One drive and the law that it follows; its target goes out in every cycle, as a service's."""
+    """One drive and its law; the target is sent in every cycle, as by a joint service."""
 
     def __init__(
         self, name: str, drive: Drive, robot: RobotConfig, plan: AnyPlan, clock: Clock
@@ -241,9 +241,9 @@ class _GuardedModule:
         return [] if self.law is None else self.law.samples
 
     def arm(self, interrupts: Interrupts, q_seen: Pair | None = None) -> str:
-        """Arm it; return why it may not move from where it is, "" if it may.
+        """Arm the drive; return why it must not move from its position, or "".
 
-        Held modules stay where they are, inside their limits or not.
+        Held modules stay where they are, even outside their limits.
         """
         reading = arm(self.drive, interrupts, self.clock)
         if isinstance(reading, str):
@@ -258,7 +258,7 @@ class _GuardedModule:
         return self.step(reading) if q_seen is None else ""
 
     def step(self, reading: DriveReading | None) -> str:
-        """Let the law answer a sample; return what speaks against going on."""
+        """Pass a sample to the law; return why the motion must stop, or ""."""
         assert self.law is not None  # noqa: S101 - `arm` came first
         target = self.law.step(self.clock(), reading)
         if target is not None:
@@ -272,7 +272,7 @@ def _follow(
     interrupts: Interrupts,
     progress: Progress,
 ) -> str:
-    """Run all laws until the motion is done; return why it was stopped before."""
+    """Run all laws until the motion is done; return why it was stopped early, or ""."""
     law, report_at_s, trouble = moved.law, 0.0, ""
     assert law is not None  # noqa: S101 - it is armed
     give_up_ns = moved.clock() + _ns(moved.plan.duration_s + OVERTIME_S)
@@ -285,7 +285,7 @@ def _follow(
             if (other := one.step(one.drive.read(0.0))) and not trouble:
                 trouble = f"{one.name}: {other}"
         if moved.clock() > give_up_ns:
-            return "it took too long: the drive's samples come too rarely"
+            return "it took too long: the drive's samples arrive too rarely"
         if law.samples and law.samples[-1].t_s >= report_at_s:
             report_at_s = law.samples[-1].t_s + PROGRESS_S
             progress(law.samples[-1])
@@ -293,7 +293,7 @@ def _follow(
 
 
 def arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | str:
-    """Arm a drive; return its first armed reading, or why there is none."""
+    """Arm a drive; return its first armed reading, or why it did not arm."""
     reading: DriveReading | None = None
     for _ in range(ARM_TRIES):
         if interrupts.number:
@@ -314,7 +314,7 @@ def arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | st
 
 
 def _idle_all(modules: Sequence[_GuardedModule]) -> tuple[str, ...]:
-    """Idle all drives, even if one of them raises; return which do not say that they are idle."""
+    """Idle all drives, even if one raises; return the modules that do not report idle."""
     left: list[str] = []
 
     def release(one: _GuardedModule) -> None:
@@ -328,7 +328,7 @@ def _idle_all(modules: Sequence[_GuardedModule]) -> tuple[str, ...]:
 
 
 def idle(drive: Drive, clock: Clock) -> bool:
-    """Idle both axes and wait until the drive says so; return False if it does not."""
+    """Idle both axes and wait until the drive reports idle; return False if it does not."""
     for attempt in range(1, IDLE_TRIES + 1):
         drive.idle()
         until = clock() + _ns(IDLE_S)
@@ -336,7 +336,7 @@ def idle(drive: Drive, clock: Clock) -> bool:
         while clock() < until:
             reading = drive.read(READ_S)
             if reading is not None:
-                # one that is unzeroed may be armed all the same
+                # an unzeroed drive may still be armed
                 is_idle = reading.status in (DriveStatus.IDLE, DriveStatus.ERROR)
         if is_idle and attempt >= IDLE_AT_LEAST:
             return True
@@ -348,26 +348,26 @@ def _ns(seconds: float) -> int:
 
 
 class Moved(NamedTuple, Generic[C]):
-    """A joint that was moved to the end of its plan."""
+    """Joint that completed its plan."""
 
     samples: list[Sample]
     plan: MotionPlan[C]
     q: dict[str, Pair]
-    """Where the modules were before, (phi, theta), rad."""
+    """Angles of the modules before the motion, (phi, theta), rad."""
 
 
 class Stopped(NamedTuple):
-    """A motion that did not come to its end, or did not begin."""
+    """Motion that was not completed, or not begun."""
 
     why: str
     not_idle: tuple[str, ...] = ()
-    """Modules whose drives do not say that they are idle."""
+    """Modules whose drives do not report that they are idle."""
     declined: bool = False
-    """The person said no."""
+    """True if the person declined."""
 
 
 def tell_stopped(stopped: Stopped, console: Console) -> int:
-    """Print why a motion ended, a danger last; return the exit code."""
+    """Print why a motion ended, with dangers last; return the exit code."""
     if stopped.declined:
         console.print(stopped.why)
         return DECLINED_EXIT_CODE
@@ -378,13 +378,13 @@ def tell_stopped(stopped: Stopped, console: Console) -> int:
 
 
 def exit_if_interrupted(interrupts: Interrupts) -> None:
-    """End the process as a shell has it after a signal."""
+    """Exit with a shell's exit code for a signal, if one arrived."""
     if interrupts.number:
         sys.exit(128 + interrupts.number)
 
 
 def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -> None:
-    """Refuse if the leg of one of these modules has a joint service up."""
+    """Raise FleetError if a joint service is up in the leg of one of these modules."""
     for name in leg_of(*modules):
         refuse_service(robot, name, run_dir)
 
@@ -399,24 +399,24 @@ def ask_and_move(
     *,
     alone: bool = False,
 ) -> Moved[C] | Stopped | None:
-    """Look at a leg, ask, and move a joint; return how it ended, or None for a dry run.
+    """Check a leg, ask, and move a joint; return how it ended, or None for a dry run.
 
     Args:
-        flags: of the verb.
-        robot: its file.
+        flags: flags of the verb.
+        robot: robot file.
         joint: module and axis.
-        plan_of: returns the motion of modules that are there, (phi, theta), rad, and tells of it.
-        interrupts: kept while drives may be armed.
-        console: to speak on.
-        alone: the module alone, within its soft limits. Else its leg hangs still first, on the
-            mechanism's stops perhaps, and the leg's other modules are held.
+        plan_of: returns and prints the plan for modules at these angles, (phi, theta), rad.
+        interrupts: deferred while drives may be armed.
+        console: for questions and progress.
+        alone: move the module alone, within its soft limits. Otherwise wait until its leg hangs
+            still, possibly on the mechanism's stops, and hold the leg's other modules.
     """
     module, axis = joint
     modules = (module,) if alone else leg_of(module)
     with (
         open_drives(robot, modules, flags.run_dir) as drives,
         interrupts.kept(),
-        console.status("looking" if alone else "waiting until the leg hangs still"),
+        console.status("checking" if alone else "waiting until the leg hangs still"),
     ):
         q = hanging_angles(drives, robot, interrupts, until_still=not alone)
     if q is None:
@@ -428,8 +428,8 @@ def ask_and_move(
         raise DriveError(f"{module}: {why}")
     if flags.dry_run:
         return None
-    what = "Is the joint free, and" if alone else "Does the leg hang free,"
-    if not confirm(f"{what} the power switch at hand?", yes=flags.yes):
+    what = "Is the joint free, and" if alone else "Does the leg hang free, and"
+    if not confirm(f"{what} is the power switch in reach?", yes=flags.yes):
         return Stopped("nothing was moved", declined=True)
     for name in modules:  # a person may take minutes to answer
         refuse_service(robot, name, flags.run_dir)
@@ -445,7 +445,7 @@ def ask_and_move(
             progress=lambda sample: show(_line(sample, plan, name)),
         )  # fmt: skip
     for one in modules:
-        # only to drives that say that they are idle: full limits are nothing for an armed one
+        # only for drives that report idle: an armed drive must not get full limits
         if one in result.not_idle:
             continue
         try:
@@ -453,7 +453,7 @@ def ask_and_move(
         except XrlError as error:
             words = (
                 "[yellow]{}: the drive still has the limits of this motion ({}): until it is "
-                "armed by its service or restarted, `xrl doctor` finds them wrong[/]"
+                "armed by its service or restarted, `xrl doctor` reports them as wrong[/]"
             )
             console.print(marked(words, one, error))
     if result.trouble or result.not_idle:
@@ -465,7 +465,7 @@ def ask_and_move(
 def open_drives(
     robot: RobotConfig, modules: Iterable[str], run_dir: Path
 ) -> Iterator[dict[str, Drive]]:
-    """Have modules' drives, each of which nobody else has."""
+    """Open modules' drives, which no other program may hold."""
     with contextlib.ExitStack() as stack:
         drives = {}
         for name in modules:
@@ -487,12 +487,12 @@ def _over_can(robot: RobotConfig, module: str, run_dir: Path) -> None:
     try:
         taken = link.connect()
         for _ in range(LIMITS_TIMES):
-            link.receive(_APART_S)  # nothing is sent to a drive that is not heard
+            link.receive(_APART_S)  # nothing is sent to a silent drive
             taken = taken and link.send(packet_of(wiring.node_ids, (limits,)))
     finally:
         link.close()
     if not taken:
-        raise DriveError(f"CAN bus {wiring.bus} takes no frames")
+        raise DriveError(f"CAN bus {wiring.bus} accepts no frames")
 
 
 def _over_usb(robot: RobotConfig, module: str, run_dir: Path) -> None:
@@ -503,17 +503,18 @@ def _over_usb(robot: RobotConfig, module: str, run_dir: Path) -> None:
         wanted[f"{axis}.motor.config.current_lim"] = drive.current_lim
     with boards_on_usb(robot, run_dir, [module]) as found:
         if serial not in found.boards:
-            raise DriveError(f"ODrive {serial}: {found.troubles.get(serial, 'not there')}")
+            raise DriveError(f"ODrive {serial}: {found.troubles.get(serial, 'not connected')}")
         board = found.boards[serial]
         board.write(wanted)
         kept = board.read(wanted)
     if not all(equal(kept.get(name), value) for name, value in wanted.items()):
-        raise DriveError(f"ODrive {serial}: it did not keep them")
+        raise DriveError(f"ODrive {serial}: it did not keep the limits")
 
 
 def _line(sample: Sample, plan: AnyPlan, joint: str) -> Text:
     axis = plan.axis
     return Text(
-        f"{joint} {sample.t_s:6.2f} of {plan.duration_s:.0f} s  asked {sample.q_ref[axis]:+.4f}, "
-        f"is {sample.q[axis]:+.4f} rad, torque {sample.tau[axis]:+6.2f} N m"
+        f"{joint} {sample.t_s:6.2f} of {plan.duration_s:.0f} s  reference "
+        f"{sample.q_ref[axis]:+.4f}, actual {sample.q[axis]:+.4f} rad, "
+        f"torque {sample.tau[axis]:+6.2f} N m"
     )

@@ -1,7 +1,7 @@
-"""ODrives over USB, by the genuine `odrive` package, for callers that may wait.
+"""Blocking access to ODrives over USB, by the genuine `odrive` package.
 
-The package lives on an asyncio loop in its own thread; here every call is handed to it and
-waited for, with a time limit. Who imports this file needs a libusb-1.0 (`UsbBus`).
+The package runs on an asyncio loop in its own thread. Every call here is passed to that loop and
+awaited with a timeout. `UsbBus` needs libusb-1.0.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from shared.exceptions import DriveError
 from tools.bringup.boards import Board, FoundBoards, Value, describe_firmware, number
 
 FIND_S: Final = 3.0
-"""Longest wait for boards to show up: discovery itself takes a few tenths."""
+"""Timeout for boards to appear, s: discovery itself takes a few tenths."""
 CONNECT_S: Final = 15.0
-"""A board that was never seen sends its whole table of endpoints first."""
+"""Timeout for a connection, s: an unknown board first sends its whole table of endpoints."""
 TRANSFER_S: Final = 5.0
 LEAVE_S: Final = 5.0
-"""From `save_configuration` until the board is gone: it writes its flash first."""
+"""Timeout from `save_configuration` until the board disconnects, s: it writes its flash first."""
 RETURN_S: Final = 15.0
-"""Until it is back."""
+"""Timeout until the board has reconnected, s."""
 
 _POLL_S = 0.02
 _ENDPOINT = "endpoint_ref"
@@ -54,7 +54,7 @@ class UsbBus:
         self._subscription: Subscription = self.run(self._watch(), TRANSFER_S)
 
     def open(self, serial_numbers: Iterable[str], timeout_s: float = FIND_S) -> FoundBoards:
-        """Connect to boards by their serial numbers, once all are plugged in or it is too long."""
+        """Connect to boards by serial number, once all are plugged in or after the timeout."""
         wanted = [serial.upper() for serial in serial_numbers]
         results = self.run(self._connect_all(wanted, timeout_s), timeout_s + CONNECT_S + TRANSFER_S)
         boards: dict[str, Board] = {}
@@ -69,7 +69,7 @@ class UsbBus:
         return FoundBoards(boards, troubles, tuple(sorted(set(self._present) - set(wanted))))
 
     def close(self) -> None:
-        """Release every board; a later call on one fails."""
+        """Release every board; later calls on a board fail."""
         with contextlib.suppress(DriveError):
             self.run(self._leave(), TRANSFER_S)
 
@@ -88,18 +88,21 @@ class UsbBus:
             task.cancel()
 
     async def connect_again(self, before: RuntimeDevice) -> RuntimeDevice:
-        """Wait until a board that is restarting has gone and come back, and connect to it."""
+        """Wait until a restarting board has disconnected and reconnected, and connect to it."""
         serial = before.serial_number
         if not await self._until(lambda: self._present.get(serial) is not before.device, LEAVE_S):
             raise DriveError(
-                f"ODrive {serial} did not restart within {LEAVE_S:g} s: nothing may be saved; "
-                "is one of its axes armed?"
+                f"ODrive {serial} did not restart within {LEAVE_S:g} s: its settings may not have "
+                "been saved; check whether one of its axes is armed"
             )
         if not await self._until(lambda: serial in self._present, RETURN_S):
-            raise DriveError(f"ODrive {serial} did not come back {RETURN_S:g} s after its restart")
+            raise DriveError(
+                f"ODrive {serial} did not come back within {RETURN_S:g} s after its restart; check "
+                "its cable and supply"
+            )
         result = await self._connect(serial)
         if isinstance(result, str):
-            raise DriveError(f"ODrive {serial} restarted, and then: {result}")
+            raise DriveError(f"ODrive {serial} restarted, but then: {result}")
         return result
 
     async def _watch(self) -> Subscription:
@@ -135,7 +138,7 @@ class UsbBus:
         return await asyncio.gather(*(self._connect(serial) for serial in serials))
 
     async def _connect(self, serial: str) -> RuntimeDevice | str:
-        """Return a board, or why there is none."""
+        """Return a board, or why it is not connected."""
         device = self._present.get(serial)
         if device is None:
             return "not plugged in"
@@ -145,7 +148,7 @@ class UsbBus:
             return f"plugged in, but silent for {CONNECT_S:g} s"
         except Exception as error:  # noqa: BLE001 - the package raises bare Exceptions
             return f"plugged in, but: {describe(error)}"
-        return connected if isinstance(connected, RuntimeDevice) else "no running ODrive"
+        return connected if isinstance(connected, RuntimeDevice) else "not a running ODrive"
 
     async def _leave(self) -> None:
         for board in self._boards:
@@ -169,7 +172,7 @@ class UsbBoard:
 
     @property
     def firmware(self) -> tuple[int, int, int]:
-        """See `Board`; 0.0.0 if it does not tell."""
+        """See `Board`; 0.0.0 if the board does not report it."""
         major, minor, revision = self.device.fw_version or (0, 0, 0)
         return int(major), int(minor), int(revision)
 
@@ -192,13 +195,13 @@ class UsbBoard:
         """See `Board`.
 
         Raises:
-            DriveError: also if the board does not have one of them; nothing is written then.
+            DriveError: also if the board lacks one of the endpoints; then nothing is written.
         """
         missing = [name for name in values if name not in self.device.properties]
         if missing:
             raise DriveError(
                 f"ODrive {self.serial_number}, firmware {describe_firmware(self.firmware)}: "
-                f"it has no {missing[0]}"
+                f"has no {missing[0]}"
             )
         self._run(self._write(values), "write")
 
@@ -242,13 +245,13 @@ class UsbBoard:
         self.device = self._run(self._left(function), function, LEAVE_S + RETURN_S + CONNECT_S)
 
     async def _left(self, function: str) -> RuntimeDevice:
-        # The board restarts before it has answered.
+        # The board restarts before it answers.
         with contextlib.suppress(Exception):
             await asyncio.wait_for(self.device.call_function(function), LEAVE_S)
         return await self._bus.connect_again(self.device)
 
     def _named(self, value: Any) -> Value:
-        """Return a value as `Value` has it: an endpoint by its name."""
+        """Return a value as a `Value`: an endpoint becomes its name."""
         if isinstance(value, AsyncProperty):
             return str(self.device.path_of(value._info))  # noqa: SLF001 - no public way
         plain: Value = value

@@ -1,23 +1,23 @@
-"""Finds again how many whole turns the motors have made since the joints' zeros. Pure.
+"""Recovers the whole turns that the motors have made since the joints' zeros. Pure.
 
-After a loss of power an absolute encoder tells its angle within the motor's turn and no turns. The
-angles that were stored with a joint's zero leave a lattice of poses: one turn of one motor is
-pi / N, 0.18 rad, in phi and in theta at once, so the nearest other pose is 0.25 rad away. Four
-things tell which pose it is:
+After a loss of power, an absolute encoder reports its angle within the motor's turn, but not the
+number of turns. With the angles stored with a joint's zero, a lattice of poses is possible: one
+turn of one motor is pi / N, 0.18 rad, in phi and in theta at once, so the nearest other pose is
+0.25 rad away. Four kinds of evidence select the pose:
 
-- Gravity. A leg that hangs free has its centre of mass below its hip, however the torso tilts: so
-  its knee hangs straight or on its stop. The hip then tells which way is up, and an IMU or a spirit
-  level does so too. A leg that leans on something looks like one that hangs, some turns off: so the
-  leg has to swing through where it rests.
-- A joint whose encoders both read what they read when it last rested has not moved. This alone
-  shows that they are the same encoders: one that was exchanged or has slipped reads something
-  else. For a joint that has moved a person has to say so.
+- Gravity. A leg that hangs free has its centre of mass below its hip at any tilt of the torso, so
+  its knee hangs straight or on its stop. The hip's pose then implies the direction of up, which an
+  IMU or a spirit level also gives. A leg that leans on something looks like a hanging leg that is
+  some turns off, so the leg must swing through its rest position.
+- The last rest. A joint has not moved if both its encoders read the same as at its last rest. Only
+  this shows that they are the same encoders: one that was exchanged or has slipped reads another
+  angle. For a joint that has moved, a person must confirm it.
 - A rough measurement by a person.
-- The limits of the joints. Gravity does not hold an ankle: its mass lies in its axis.
+- The limits of the joints. Gravity says nothing about an ankle, whose mass lies on its axis.
 
-A pose is taken if friction and errors of the model explain it, and the second best takes at least
-`CLEAR` times as much. Everything else is refused: a wrong turn makes the robot fall, a protractor
-takes a minute.
+A pose is accepted if friction and errors of the model explain it, and the second-best pose needs at
+least `CLEAR` times what they explain. Everything else is refused: a wrong turn makes the robot
+fall, a protractor takes a minute.
 """
 
 from __future__ import annotations
@@ -36,80 +36,81 @@ from shared.joints import KINDS, SIDES, kind_of, side_of
 from tools.bringup.hanging_leg import BEYOND, Upright, angle, implied_up, leg_scores, not_swung
 
 CLEAR: Final = 1.5
-"""Times what is explained that the second best pose must take."""
+"""Minimum error of the second-best pose, as a multiple of the error that is explained."""
 READS_ZERO: Final = 1e-4
-"""turns: nearer to 0 than two counts of 16384, an encoder may read nothing but 0."""
+"""An encoder nearer to 0 than this, turns (less than two counts of 16384), may be stuck at 0."""
 UNMOVED: Final = 0.0015
-"""turns; encoders that both read the same so closely have not moved: 0.3 mrad at the joint, more
-than an encoder's error changes with its temperature. A joint that was moved reads so by chance once
-in 110 000 times."""
+"""Maximum change of both encoders' angles if a joint has not moved, turns: 0.3 mrad at the joint,
+more than an encoder's error changes with temperature. A joint that was moved reads this by chance
+once in 110 000 times."""
 BESIDE_MOVED: Final = 0.2
-"""Fraction of `UNMOVED` for a joint of whose leg another one has moved: once in 3 million times."""
+"""Fraction of `UNMOVED` for a joint if another joint of its leg has moved: by chance once in 3
+million times."""
 STAYED: Final = 2.0
-"""Times `UNMOVED` from which a motor has moved for sure."""
+"""Multiple of `UNMOVED` from which a motor has certainly moved."""
 MEASURED: Final = 0.08
-"""rad by which a rough measurement may be off."""
+"""Maximum error of a rough measurement, rad."""
 LEGS_APART: Final = 0.1
-"""rad by which the two legs may differ in which way is up."""
+"""Maximum difference between the two legs' directions of up, rad."""
 
-UNTOUCHED: Final = "no encoder, magnet, motor or encoder cable was touched since its zero"
+UNTOUCHED: Final = "no encoder, magnet, motor or encoder cable has been touched since its zero"
 SWING: Final = "let it swing (--swing)"
-PROTRACTOR: Final = "zero it by a protractor (--at), as on the first day"
+PROTRACTOR: Final = "zero it with a protractor (--at), as on the first day"
 ROUGHLY: Final = (
     f"measure it to {MEASURED:g} rad ({math.degrees(MEASURED):.1f} degrees) and add --at PHI,THETA"
 )
 
 
 class ModuleEvidence(NamedTuple):
-    """What is known of a module without its turns; motor turns are from the joint's zero."""
+    """Evidence for a module's turns; motor turns are counted from the joint's zero."""
 
     offsets: Pair
-    """Motor turns, but for whole ones, at which each encoder reads 0."""
+    """Motor turns, modulo 1, at which each encoder reads 0."""
     angles: Pair
-    """Where the encoders are within the turn now, turns."""
+    """Present angles of the encoders within the turn, turns."""
     rest: Pair | None = None
-    """Motor turns where the joint last rested, powered and zeroed; None: unknown."""
+    """Motor turns at the joint's last rest, powered and zeroed; None if unknown."""
     about: Pair | None = None
-    """(phi, theta) as somebody has measured them, rad."""
+    """(phi, theta) measured by a person, rad."""
     swing: tuple[Pair, Pair] | None = None
-    """Lowest and highest (phi, theta) seen since a first look, from where it rests now, rad."""
+    """Lowest and highest (phi, theta) seen, relative to the present rest, rad."""
     untouched: bool = False
-    """Somebody says that its encoders, magnets, motors and cables are those of the zero."""
+    """True if a person confirms that encoders, magnets, motors and cables are those of the zero."""
     stranger: str = ""
-    """Why board or encoders are not those of the zero; "" if nothing speaks against it."""
+    """Why board or encoders are not those of the zero, or ""."""
 
 
 class Decision(NamedTuple):
-    """What came of a module."""
+    """Decision about a module."""
 
     q: Pair | None
-    """(phi, theta), rad; None: refused."""
+    """(phi, theta), rad; None if refused."""
     by: str
-    """What decided it: "gravity", "unmoved" or "measured"; "" where refused."""
+    """Deciding evidence: "gravity", "unmoved" or "measured"; "" if refused."""
     second: float
-    """rad from it to the second best pose; inf if there is none."""
+    """Distance to the second-best pose, rad; inf without a second pose."""
     times: float
-    """How many times what is allowed the second best takes."""
+    """Error of the second-best pose, as a multiple of the allowed error."""
     why: str
-    """Why it was refused, and what to do; "" if it was not."""
+    """Reason for the refusal, and remedy; "" if it was not refused."""
 
 
 class _Candidates(NamedTuple):
-    """Poses of a module that its angles allow, and what its own evidence says of them."""
+    """Poses of a module that its angles allow, and the decision by its own evidence."""
 
     poses: Array
     """(n, 2): phi, theta, rad."""
     own: Decision | None
-    """What its own evidence decides: a pose, or to refuse; None: gravity is left."""
+    """Decision by its own evidence, a pose or a refusal; None if gravity must decide."""
 
     @property
     def unmoved(self) -> bool:
-        """True if its pose is that of its rest, which is not to speak against gravity."""
+        """True if its pose is that of its last rest, which must not contradict gravity."""
         return self.own is not None and self.own.by == "unmoved"
 
     @property
     def q(self) -> Array:
-        """The poses that are left, (1, 2) if its own evidence has decided, (0, 2) if it refuses."""
+        """Remaining poses, (1, 2) if its own evidence has decided, (0, 2) if it refuses."""
         if self.own is None:
             return self.poses
         return np.empty((0, 2)) if self.own.q is None else np.array([self.own.q])
@@ -122,7 +123,7 @@ def poses_of(evidence: ModuleEvidence, robot: RobotConfig, module: str) -> Array
     half = math.pi / robot.joint.gear_ratio
     first = [a + b for a, b in zip(evidence.offsets, evidence.angles, strict=True)]
     low, high = theta_low - 2.0 * BEYOND, theta_high + 2.0 * BEYOND
-    # of theta + phi and theta - phi, which are the motors'
+    # of theta + phi and theta - phi, which are the motors' angles
     spans = ((low + phi_low, high + phi_high), (low - phi_high, high - phi_low))
     turns = [
         start + np.arange(math.ceil(low / (2.0 * half) - start), high / (2.0 * half) - start + 1e-9)
@@ -139,9 +140,9 @@ def poses_of(evidence: ModuleEvidence, robot: RobotConfig, module: str) -> Array
 def decide(
     robot: RobotConfig, evidence: Mapping[str, ModuleEvidence], upright: Upright
 ) -> dict[str, Decision]:
-    """Return the pose of each module, or why none is taken.
+    """Return the pose of each module, or why it is refused.
 
-    Hips and knees hang; where one is to be found by gravity, both of its leg are evidence.
+    Hips and knees hang; gravity decides a leg's knee and hip only if both are in the evidence.
     """
     found: dict[str, Decision] = {}
     ups: dict[str, Array] = {}
@@ -150,7 +151,7 @@ def decide(
         ankle, knee, hip = (f"{kind}_{side}" for kind in ("ankle", "knee", "hip"))
         if ankle in evidence:
             found[ankle] = candidates[ankle].own or _refused(
-                f"{_since(evidence[ankle])}, and gravity does not hold an ankle: "
+                f"{_since(evidence[ankle])}, and gravity says nothing about an ankle: "
                 f"{len(candidates[ankle].poses)} poses are possible; {ROUGHLY}"
             )
         if knee in evidence and hip in evidence:
@@ -160,7 +161,7 @@ def decide(
             if q_knee and q_hip and "measured" not in (leg[knee].by, leg[hip].by):
                 ups[side] = implied_up(robot, np.array([q_knee]), np.array([q_hip]))[0, 0]
         else:
-            alone = "gravity tells a knee and its hip together: look at both"
+            alone = "gravity decides knee and hip together; both need a zero and a readable drive"
             for name in {knee, hip} & set(evidence):
                 own = candidates[name].own
                 is_taken = own is not None and not candidates[name].unmoved
@@ -169,8 +170,8 @@ def decide(
         apart = float(angle(ups["right"], ups["left"]))
         if apart > LEGS_APART:
             why = (
-                f"the legs differ by {apart:.2f} rad in which way is up: one leans on something, "
-                "or binds; let both hang free, and again"
+                f"the legs' directions of up differ by {apart:.2f} rad: one leans on something or "
+                "binds; let both hang free, and try again"
             )
             legs = [f"{kind}_{side}" for side in SIDES for kind in ("knee", "hip")]
             found |= {name: _refused(why) for name in legs}
@@ -180,7 +181,7 @@ def decide(
 def _candidates(
     robot: RobotConfig, evidence: Mapping[str, ModuleEvidence], module: str
 ) -> _Candidates:
-    """Return a module's poses, and what all evidence but gravity says of them."""
+    """Return a module's poses, and the decision by all evidence except gravity."""
     one, poses = evidence[module], poses_of(evidence[module], robot, module)
     leg = [evidence.get(f"{kind}_{side_of(module)}") for kind in KINDS]
     rests = all(other is not None and _moved(other, UNMOVED) is None for other in leg)
@@ -191,13 +192,13 @@ def _candidates(
 def _own(
     evidence: ModuleEvidence, poses: Array, gear_ratio: float, unmoved: float
 ) -> Decision | None:
-    """Decide a module by itself; None: gravity may. Encoders so near to their rest are unmoved."""
+    """Decide by a module's own evidence; None if gravity must. `unmoved`: tolerance, turns."""
     if not len(poses):
         return _refused(f"its angles fit no pose inside its limits; {PROTRACTOR}")
     if any(min(angle, 1.0 - angle) < READS_ZERO for angle in evidence.angles):
         return _refused(
-            "an encoder reads exactly 0, as one without power or with a broken line does; "
-            "move the joint a little, and again"
+            "an encoder reads exactly 0, like one without power or with a broken wire; "
+            "move the joint a little, and try again"
         )
     if evidence.stranger:
         return _refused(f"{evidence.stranger}; {PROTRACTOR}")
@@ -207,9 +208,7 @@ def _own(
     if moved is None and evidence.rest is not None and evidence.about is None:
         return _rested(evidence.rest, poses, gear_ratio, unmoved)
     if moved is not None and not evidence.untouched:
-        return _refused(
-            f"{_since(evidence)}: if {UNTOUCHED}, say so (--untouched); else {PROTRACTOR}"
-        )
+        return _refused(f"{_since(evidence)}: if {UNTOUCHED}, add --untouched; else {PROTRACTOR}")
     return None if evidence.about is None else _measured(evidence.about, poses)
 
 
@@ -220,10 +219,10 @@ def _leg(
     side: str,
     upright: Upright,
 ) -> dict[str, Decision]:
-    """Decide knee and hip of a leg, which gravity ties together.
+    """Decide knee and hip of a leg, which gravity couples.
 
-    A knee a turn off moves the leg's centre of mass by 0.17 rad about the hip, which no turn of the
-    hip makes good: 0.09 rad are left.
+    A knee that is a turn off moves the leg's centre of mass by 0.17 rad about the hip. No turn of
+    the hip compensates for this: 0.09 rad remain.
     """
     names = knee, hip = f"knee_{side}", f"hip_{side}"
     own = {name: candidates[name].own for name in names}
@@ -232,7 +231,7 @@ def _leg(
     for name in names:
         refused = own[name]
         if refused is not None and refused.q is None:
-            why = f"gravity tells it together with {name}, which is refused; {ROUGHLY}"
+            why = f"gravity decides it only together with {name}, which is refused; {ROUGHLY}"
             others = {n: o if o and o.by == "measured" else _refused(why) for n, o in own.items()}
             return others | {n: o for n, o in own.items() if o is not None and o.q is None}
     q_knee, q_hip = candidates[knee].q, candidates[hip].q
@@ -243,8 +242,8 @@ def _leg(
         if score <= CLEAR:
             return {name: one for name, one in own.items() if one is not None}
         why = (
-            f"its leg has not moved since it last rested, and does not hang: it takes {score:.1f} "
-            f"times what friction and errors of the robot file explain; {ROUGHLY}"
+            "its leg has not moved since its last rest, but does not hang: its error is "
+            f"{score:.1f} times what friction and the robot file's errors explain; {ROUGHLY}"
         )
         return {
             name: one if one is not None and one.by == "measured" else _refused(why)
@@ -258,14 +257,14 @@ def _leg(
     if not why and score > 1.0:
         why = (
             f"its leg does not hang free: the best pose, knee {_words(q_knee[best[0]])} and hip "
-            f"{_words(q_hip[best[1]])}, takes {score:.1f} times what friction and errors of the "
-            f"robot file explain; let it swing, and again; or {ROUGHLY}"
+            f"{_words(q_hip[best[1]])}, has {score:.1f} times the error that friction and the "
+            f"robot file's errors explain; let it swing and try again, or {ROUGHLY}"
         )
     if not why and times < CLEAR:
         why = (
             f"a second pose of its leg, knee {_words(q_knee[second[0]])} and hip "
-            f"{_words(q_hip[second[1]])}, takes only {times:.1f} times what friction and errors "
-            f"of the robot file explain, {CLEAR:g} are wanted; {ROUGHLY}"
+            f"{_words(q_hip[second[1]])}, has only {times:.1f} times the error that friction and "
+            f"the robot file's errors explain; at least {CLEAR:g} times is required; {ROUGHLY}"
         )
     steps = [q[one] - q[o] for q, one, o in zip((q_knee, q_hip), best, second, strict=True)]
     away = float(np.linalg.norm(steps))
@@ -283,20 +282,20 @@ def _leg(
 
 
 def _why_not_by_gravity(evidence: Mapping[str, ModuleEvidence], side: str, upright: Upright) -> str:
-    """Return what is missing to find a leg's turns by gravity; "" if nothing is."""
+    """Return the evidence that is missing to find a leg's turns by gravity, or ""."""
     if not upright.is_known:
         return (
-            "nothing tells which way is up: fit an IMU, or level the torso by a spirit level and "
-            f"add --level; or {ROUGHLY}"
+            "the direction of up is unknown: fit an IMU, or level the torso with a spirit level "
+            f"and add --level; or {ROUGHLY}"
         )
     for kind in ("hip", "knee"):
         swing = evidence[f"{kind}_{side}"].swing
         if swing is None:
-            return f"whether its leg hangs free or leans on something is not known: {SWING}"
+            return f"it is unknown whether its leg hangs free or leans on something: {SWING}"
         missing = not_swung(swing, knee=kind == "knee")
         if missing:
             return (
-                f"its leg's {kind} has not swung past where it rests in {missing}: it leans on "
+                f"its leg's {kind} has not swung past its rest position in {missing}: it leans on "
                 f"something or binds, or was pushed too little; {SWING} again"
             )
     return ""
@@ -309,8 +308,8 @@ def _measured(about: Pair, poses: Array) -> Decision:
     if off[best] > MEASURED:
         return _refused(
             f"the nearest pose that its encoders allow, {_words(poses[best])} rad, is "
-            f"{off[best]:.2f} rad from what was measured, {MEASURED:g} are allowed: measure again; "
-            f"if it stays so, its zero is another's: {PROTRACTOR}"
+            f"{off[best]:.2f} rad from the measurement, and at most {MEASURED:g} is allowed: "
+            f"measure again; if this remains, the stored zero is wrong: {PROTRACTOR}"
         )
     phi, theta = map(float, poses[best])
     if len(poses) == 1:
@@ -321,10 +320,10 @@ def _measured(about: Pair, poses: Array) -> Decision:
 
 
 def _moved(evidence: ModuleEvidence, unmoved: float) -> str | None:
-    """Return None for a joint within so many turns of its rest, else what is wrong with it.
+    """Return None for a joint within `unmoved` turns of its rest, else the fault found, or "".
 
-    A joint that moves turns both motors. One encoder that stayed beside one that did not, or two
-    that read each other's angles, were exchanged.
+    A joint that moves turns both motors. If only one encoder's angle has changed, or both encoders
+    read each other's angles, they were exchanged.
     """
     if evidence.rest is None:
         return ""
@@ -335,8 +334,8 @@ def _moved(evidence: ModuleEvidence, unmoved: float) -> str | None:
     if min(apart) <= UNMOVED and max(apart) > STAYED * UNMOVED:
         axis = apart.index(max(apart))
         return (
-            f"axis{axis}'s encoder reads {apart[axis]:.3f} turns off and axis{1 - axis}'s has not "
-            f"moved: axis{axis}'s was exchanged, or has slipped"
+            f"axis{axis}'s encoder is off by {apart[axis]:.3f} turns, but axis{1 - axis}'s has not "
+            f"moved: axis{axis}'s was exchanged or has slipped"
         )
     if min(apart) <= STAYED * UNMOVED:
         return ""
@@ -352,7 +351,7 @@ def _rested(rest: Pair, poses: Array, gear_ratio: float, unmoved: float) -> Deci
     best = int(np.argmin(away))
     if away[best] > UNMOVED:
         return _refused(
-            f"it has not moved since it last rested, outside of its limits; {PROTRACTOR}"
+            f"it has not moved since its last rest, which is outside its limits; {PROTRACTOR}"
         )
     phi, theta = map(float, poses[best])
     others = np.delete(poses, best, axis=0)
@@ -361,8 +360,8 @@ def _rested(rest: Pair, poses: Array, gear_ratio: float, unmoved: float) -> Deci
 
 
 def _since(evidence: ModuleEvidence) -> str:
-    """Return why its rest does not tell."""
-    return "it has moved since it last rested" if evidence.rest else "no rest of it is stored"
+    """Return why its last rest does not decide."""
+    return "it has moved since its last rest" if evidence.rest else "no rest is stored for it"
 
 
 def _refused(why: str) -> Decision:

@@ -1,8 +1,8 @@
-"""Zeros as they are kept over a loss of power, and the evidence by which they are resumed.
+"""Zeros stored for a loss of power, and the evidence for resuming them.
 
-The file stands beside the robot file; an emulated robot's in its run directory, where it ends with
-the emulated drives. It is written by `xrl drive zero` and `xrl down`, never by a service: what it
-says of the last rest may be wrong since, and is evidence only (`tools.bringup.whole_turns`).
+The file is beside the robot file; an emulated robot's file is in its run directory and ends with
+the emulated drives. `xrl drive zero` and `xrl down` write it, never a service. The last rest in it
+may be outdated, so it is only evidence (`tools.bringup.whole_turns`).
 """
 
 from __future__ import annotations
@@ -45,48 +45,48 @@ IDENTITY: Final = tuple(
     for axis in (0, 1)
     for name in (*(f"encoder.config.{each}" for each in _CALIBRATION), "motor.config.pole_pairs")
 )
-"""Settings that an encoder's calibration finds anew, or that tell which encoder it is."""
+"""Settings that a new calibration of an encoder changes, or that identify the encoder."""
 
 IMU_WITHIN: Final = 0.02
-"""rad of an IMU's error, its mounting's included."""
+"""Maximum error of an IMU, including its mounting, rad."""
 LEVEL_WITHIN: Final = 0.035
-"""rad to which a person levels a torso by a spirit level: 2 degrees."""
+"""Maximum error of a person who levels a torso with a spirit level, rad: 2 degrees."""
 IMU_S: Final = 1.0
 REST_WAIT_S: Final = 20.0
-"""Longest wait until legs that were let go have swung out."""
+"""Timeout for released legs to stop swinging, s."""
 ROUND_S: Final = 0.8
-"""From one look to the next: not half a swing of a leg, which takes 1 s."""
+"""Period of the looks, s: it must not be half a swing of a leg, which takes 1 s."""
 
 Progress = Callable[[str], None]
 
 
 class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a board on USB tells of itself and its encoders."""
+    """Identity of a board on USB and of its encoders."""
 
     serial_number: str
     calibration: dict[str, Value]
-    """Of `IDENTITY` what the board has."""
+    """The settings of `IDENTITY` that the board has."""
 
 
 class ModuleZero(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One module's zero; motor turns are from q = 0, as the joint counts them."""
 
     time: str
-    """When it was zeroed, ISO 8601."""
+    """Time of the zero, ISO 8601."""
     serial_number: str
-    """The board's, as the robot file had it."""
+    """Serial number of the board, from the robot file."""
     motor_signs: Signs
     offsets: Pair
-    """Motor turns, but for whole ones, at which each encoder reads 0."""
+    """Motor turns, modulo 1, at which each encoder reads 0."""
     identity: Identity | None
-    """None: the board was not on USB."""
+    """None if the board was not on USB."""
     rest: Pair | None
-    """Motor turns where it last rested with its drive idle."""
+    """Motor turns at the last rest with the drive idle; None if unknown."""
     rest_time: str
 
 
 class ZeroRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The file."""
+    """File of the stored zeros."""
 
     gear_ratio: float
     encoder_counts_per_turn: int
@@ -101,7 +101,7 @@ def path_of(robot: RobotConfig, config: Path, run_dir: Path) -> Path:
 
 
 def read_zeros(path: Path, robot: RobotConfig) -> ZeroRecord:
-    """Read the zeros; none if there is no file."""
+    """Read the zeros; return an empty record if there is no file."""
     joint = robot.joint
     empty = ZeroRecord(
         gear_ratio=joint.gear_ratio, encoder_counts_per_turn=joint.encoder_counts_per_turn
@@ -114,26 +114,27 @@ def read_zeros(path: Path, robot: RobotConfig) -> ZeroRecord:
         raise DriveError(f"{path}: cannot be read: {error.strerror}") from None
     except (msgspec.DecodeError, UnicodeError) as error:
         raise DriveError(
-            f"{path}: no zeros of `xrl drive zero`: {error}; remove it, and zero by a protractor"
+            f"{path}: not a file of `xrl drive zero`: {error}; remove it and zero with a protractor"
         ) from None
     for key in ("gear_ratio", "encoder_counts_per_turn"):
         if getattr(record, key) != getattr(empty, key):
             raise DriveError(
-                f"{path}: {key} {getattr(record, key):g}, and the robot file has "
-                f"{getattr(empty, key):g}: these are no zeros of this robot; remove it, and zero "
-                "by a protractor"
+                f"{path}: {key} is {getattr(record, key):g}, but the robot file has "
+                f"{getattr(empty, key):g}: these zeros belong to another robot; remove the file, "
+                "and zero with a protractor"
             )
     return record
 
 
 def write_zeros(path: Path, record: ZeroRecord) -> None:
-    """Write the zeros, whole and on the disk."""
+    """Write the zeros atomically, and flush them to the disk."""
     try:
         with atomic_file(path, lasting=True) as file:
             file.write(msgspec.json.format(msgspec.json.encode(record)) + b"\n")
     except OSError as error:
         raise DriveError(
-            f"{path}: the zeros cannot be kept over a loss of power: {error.strerror}"
+            f"{path}: the zeros cannot be saved, and will not survive a loss of power: "
+            f"{error.strerror}"
         ) from None
 
 
@@ -155,7 +156,7 @@ def zeroed(
 
 
 def with_rests(record: ZeroRecord, rests: Mapping[str, Pair | None]) -> ZeroRecord:
-    """Return the zeros with other rests, motor turns; None: unknown."""
+    """Return the zeros with new rests, motor turns; None is unknown."""
     now, modules = timestamp(), dict(record.modules)
     for name, rest in rests.items():
         modules[name] = msgspec.structs.replace(modules[name], rest=rest, rest_time=now)
@@ -165,35 +166,37 @@ def with_rests(record: ZeroRecord, rests: Mapping[str, Pair | None]) -> ZeroReco
 def why_stranger(
     zero: ModuleZero, robot: RobotConfig, module: str, identity: Identity | None
 ) -> str:
-    """Return why a board or its encoders are not those of a zero; "" if nothing speaks for it."""
+    """Return why a board or its encoders are not those of a zero, or ""."""
     wiring = robot.module_named(module)
     if wiring.serial_number.upper() != zero.serial_number:
         return (
-            f"the robot file has board {wiring.serial_number or 'without number'}, and the zero "
+            f"the robot file has board {wiring.serial_number or 'without number'}, but the zero "
             f"is of board {zero.serial_number or 'without number'}"
         )
     if wiring.motor_signs != zero.motor_signs:
-        return f"motor_signs are {wiring.motor_signs}, and were {zero.motor_signs} at its zero"
+        return f"motor_signs are {wiring.motor_signs}, but were {zero.motor_signs} at its zero"
     if identity is None or zero.identity is None:
         return ""
     if identity.serial_number != zero.identity.serial_number:
-        return f"board {identity.serial_number} is not {zero.identity.serial_number} of its zero"
+        return (
+            f"it is board {identity.serial_number}, not {zero.identity.serial_number} of its zero"
+        )
     for name, before in zero.identity.calibration.items():
         now = identity.calibration.get(name)
         if not equal(now, before):
-            return f"it was calibrated since its zero: {name} is {now}, and was {before}"
+            return f"it was calibrated since its zero: {name} is {now}, but was {before}"
     return ""
 
 
 def timestamp() -> str:
-    """Return the time now, ISO 8601, local with its offset."""
+    """Return the local time with its offset, ISO 8601."""
     return time.strftime("%Y-%m-%dT%H:%M:%S%z")
 
 
 def drives_of(
     robot: RobotConfig, modules: Iterable[str], run_dir: Path
 ) -> AbstractContextManager[dict[str, Drive]]:
-    """Have modules' drives as they count themselves, without the mark of a zero."""
+    """Open modules' drives in their own count, without the mark of a zero."""
     unmarked = msgspec.structs.replace(robot.drive, zero_mark_turns=0.0)
     return open_drives(msgspec.structs.replace(robot, drive=unmarked), modules, run_dir)
 
@@ -201,9 +204,9 @@ def drives_of(
 def looks_at_rest(
     drives: Mapping[str, Drive], robot: RobotConfig
 ) -> tuple[dict[str, DriveLook], set[str]]:
-    """Look at drives until their joints rest, `REST_WAIT_S` at the most; return which do not.
+    """Look at drives until their joints rest, for at most `REST_WAIT_S`; return which do not.
 
-    A leg that swings out turns round slowly: its encoders have to read the same a while later.
+    A swinging leg is slow where it reverses, so its encoders must read the same after `ROUND_S`.
     """
     until = time.monotonic() + REST_WAIT_S
     before: dict[str, DriveLook] = {}
@@ -223,7 +226,7 @@ def looks_at_rest(
 
 
 def same_angles(seen: DriveLook, before: DriveLook | None, within: float) -> bool:
-    """Return True if two looks show the same angles, within so many turns."""
+    """Return True if two looks show the same angles within a tolerance, turns."""
     if before is None or seen.angles is None or before.angles is None:
         return False
     off = [a - b for a, b in zip(seen.angles, before.angles, strict=True)]
@@ -233,9 +236,9 @@ def same_angles(seen: DriveLook, before: DriveLook | None, within: float) -> boo
 def identities(
     robot: RobotConfig, run_dir: Path, modules: Collection[str], progress: Progress
 ) -> dict[str, Identity]:
-    """Return what the boards that are on USB tell of themselves; they are read, no more.
+    """Return the identities of the boards that are on USB; the boards are only read.
 
-    An emulated robot's boards are on USB only where its services use that.
+    An emulated robot's boards are on USB only if its services use USB.
     """
     if is_simulated(robot) and robot.joint_service.driver != "odrive_usb":
         return {}
@@ -252,32 +255,32 @@ def identities(
     missing = [module for module in modules if module not in found]
     if missing:
         progress(
-            f"{', '.join(missing)}: not on USB; whether board and calibration are those of the "
-            "zero is not compared"
+            f"{', '.join(missing)}: not on USB, so board and calibration are not compared with "
+            "those of the zero"
         )
     return found
 
 
 def why_not_kept(robot: RobotConfig, seen: DriveLook, identity: Identity | None) -> str:
-    """Return why a zero cannot be kept over a loss of power; "" if it can."""
+    """Return why a zero cannot be stored for a loss of power; "" if it can."""
     if seen.angles is None:
         return (
-            "its drive tells no angle within the turn, as firmware 0.6 over CAN; after each loss "
-            "of power zero it by a protractor"
+            "its drive does not report the angle within the turn, like firmware 0.6 over CAN; zero "
+            "it with a protractor after each loss of power"
         )
     modes = [] if identity is None else [
         value for name, value in identity.calibration.items() if name.endswith("config.mode")
     ]  # fmt: skip
     if not is_simulated(robot) and any(not int(mode or 0) & ABSOLUTE for mode in modes):
-        return "its encoders are not absolute; after each loss of power zero it by a protractor"
+        return "its encoders are not absolute; zero it with a protractor after each loss of power"
     return ""
 
 
 def upright(robot: RobotConfig, run_dir: Path, *, level: bool) -> Upright:
-    """Return which way is up: by the IMU, or by the person who has levelled the torso.
+    """Return the direction of up: from the IMU, or from the person who has levelled the torso.
 
     Raises:
-        DriveError: the IMU that is fitted tells nothing valid.
+        DriveError: the fitted IMU sends no valid attitude.
     """
     imu = robot.imu
     if not imu.fitted:
@@ -293,8 +296,8 @@ def upright(robot: RobotConfig, run_dir: Path, *, level: bool) -> Upright:
         sensor.close()
     if not reading.valid:
         raise DriveError(
-            "the IMU tells nothing valid; see `xrl doctor`, or set imu.fitted = false, level the "
-            "torso by a spirit level and add --level"
+            "the IMU sends no valid attitude; see `xrl doctor`, or set imu.fitted = false, level "
+            "the torso with a spirit level and add --level"
         )
     return Upright(reading.up, IMU_WITHIN)
 
@@ -309,7 +312,7 @@ def evidence_of(
     about: Mapping[str, Pair],
     swings: Mapping[str, Swing],
 ) -> dict[str, ModuleEvidence]:
-    """Return the evidence of every module that has a stored zero and tells its angles."""
+    """Return the evidence of every module that has a stored zero and reports its angles."""
     return {
         module: ModuleEvidence(
             zero.offsets, seen.angles, zero.rest, about.get(module), swings.get(module),
@@ -323,9 +326,9 @@ def evidence_of(
 def store_rests(
     robot: RobotConfig, config: Path, run_dir: Path, modules: Collection[str], progress: Progress
 ) -> int:
-    """Store where modules rest now, once their legs have swung out; return how many do.
+    """Store where modules rest once their legs have stopped swinging; return how many rest.
 
-    A module that does not rest, or has another zero than the stored one, keeps no rest.
+    A module that does not rest, or whose zero is not the stored one, has its rest erased.
 
     Raises:
         DriveError: no zero is stored, or the file cannot be written.
@@ -334,7 +337,7 @@ def store_rests(
     record = read_zeros(path, robot)
     known = [module for module in modules if module in record.modules]
     if not known:
-        raise DriveError(f"{path}: no zero of {', '.join(modules)} is stored: `xrl drive zero`")
+        raise DriveError(f"{path}: has no zero of {', '.join(modules)}; run `xrl drive zero`")
     ratio = robot.joint.gear_ratio
     rests: dict[str, Pair | None] = {}
     with drives_of(robot, known, run_dir) as drives:
@@ -344,15 +347,15 @@ def store_rests(
             why = why or not_its_zero(seen, record.modules[module].offsets, ratio)
             rests[module] = None if why else motor_from_joint(seen.q_there, ratio)
             if why:
-                progress(f"{module}: where it rests is not kept: {why}")
+                progress(f"{module}: its rest position is not stored: {why}")
     write_zeros(path, with_rests(record, rests))
     return sum(rest is not None for rest in rests.values())
 
 
 def rests_after_down(config: Path, run_dir: Path, services: Iterable[str]) -> str:
-    """Store where the modules of a fleet that is down rest, on real drives; return what came of it.
+    """Store where the modules of a stopped fleet rest, on real drives; return the result as text.
 
-    "" where there is nothing to say: emulated drives are gone, and without a zero nothing is kept.
+    The text is "" if nothing can be stored: emulated drives are gone, or there are no zeros.
     """
     modules = [name for name in services if name in MODULES]
     lines: list[str] = []
@@ -362,9 +365,9 @@ def rests_after_down(config: Path, run_dir: Path, services: Iterable[str]) -> st
         if is_simulated(robot) or not modules or not path.is_file():
             return ""
         kept = store_rests(robot, config, run_dir, modules, lines.append)
-        lines.append(f"{kept} of {len(modules)} modules rest; where is kept in {path}")
+        lines.append(f"{kept} of {len(modules)} modules rest; their positions are in {path}")
     except XrlError as error:
-        lines.append(f"where the joints rest is not kept: {error}")
+        lines.append(f"the joints' rest positions are not stored: {error}")
     return "\n".join(lines)
 
 
@@ -373,9 +376,9 @@ def not_its_zero(seen: DriveLook, offsets: Pair, gear_ratio: float) -> str:
     if not seen.zeroed:
         return "it is unzeroed"
     if seen.angles is None:
-        return "its drive tells no angle within the turn"
+        return "its drive does not report the angle within the turn"
     turns = motor_from_joint(seen.q_there, gear_ratio)
     off = [t - a - o for t, a, o in zip(turns, seen.angles, offsets, strict=True)]
     if max(abs(each - round(each)) for each in off) > UNMOVED:
-        return "its zero is not the stored one: `xrl drive zero` it again"
+        return "its zero is not the stored one; run `xrl drive zero` again"
     return ""

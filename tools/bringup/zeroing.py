@@ -1,8 +1,8 @@
-"""Writes a joint's position to its drive (look, judge, write, read back), and watches legs swing.
+"""Writes a joint's position to its drive (check, write, read back), and watches legs swing.
 
 Positions here are in the drive's own count; `services.joint.drivers.wired_drive` says why a motor
-at q = 0 gets a mark and not 0. The functions take a `Drive` without that wrapper: behind the mark
-an armed drive that lost its zero would only look unzeroed.
+at q = 0 gets a mark instead of 0. The functions take a `Drive` without that wrapper, because the
+wrapper would report an armed drive that lost its zero only as unzeroed.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ from tools.bringup.hanging_leg import not_swung
 from tools.bringup.motion_runner import NO_ANSWER, STILL, STILL_FOR_S, await_reading
 
 LOOK_S: Final = 0.3
-"""A joint is watched for so long before it is taken to be still."""
+"""Time for which a joint is watched before it counts as still, s."""
 STILL_RATE: Final = 0.05
-"""rad/s; an encoder count in a millisecond is 0.02 rad/s at the joint."""
+"""Maximum rate of a still joint, rad/s; one encoder count in 1 ms is 0.02 rad/s at the joint."""
 MOVED_MAX: Final = 0.005
-"""rad in `LOOK_S`."""
+"""Maximum motion of a still joint in `LOOK_S`, rad."""
 WITHIN: Final = 0.002
-"""rad; largest difference between the position read back and the one written."""
+"""Maximum difference between the position read back and the one written, rad."""
 HELD_WITHIN: Final = 0.03
-"""rad; the same where its joint service has armed it meanwhile: the joint sags a little."""
+"""The same if its joint service has armed the drive since, rad: the joint sags a little."""
 TAKEN_S: Final = 0.1
-"""s; samples this soon after a write may be older than it."""
+"""Samples within this time after a write may be older than the write, s."""
 SET_S: Final = 0.5
-"""Time for one attempt to read back right; frames may get lost, so there are some."""
+"""Timeout of one attempt to read back right, s; frames may get lost, so there are several."""
 SETTLED_S: Final = 0.1
-"""s of reading before a position is written."""
+"""Time for which the drive is read before a position is written, s."""
 ATTEMPTS: Final = 4
 _READ_S: Final = 0.05
 
 HOW: Final = (
     "push the foot of each leg forward and to its right, so that knee and hip move, and let go: "
-    "it has to swing back past where it rests by itself, and to come to rest"
+    "the leg must swing back past its rest position on its own, and come to rest"
 )
 WAIT_S: Final = 180.0
 PROGRESS_S: Final = 1.0
 _SWING_READ_S: Final = 0.005
 
 Swing = tuple[Pair, Pair]
-"""Lowest and highest (phi, theta), from where the joint rests, rad."""
+"""Lowest and highest (phi, theta), relative to the joint's rest position, rad."""
 
 
 class Back(NamedTuple):
@@ -62,25 +62,25 @@ class Back(NamedTuple):
     q: Pair
     """(phi, theta), rad."""
     armed: bool
-    """Its joint service has armed it: it is not written again."""
+    """True if its joint service has armed the drive, which is then not written again."""
 
 
 class DriveLook(NamedTuple):
-    """A drive's samples over a moment."""
+    """Summary of a drive's samples over `LOOK_S`."""
 
     status: DriveStatus
-    """As the drive is, its zero not considered: ARMED if it is in closed loop."""
+    """Status regardless of the zero: ARMED if the drive is in closed loop."""
     zeroed: bool
     q: Pair
-    """(phi, theta) by the zero it has, rad; means nothing if it has none."""
+    """(phi, theta) by the drive's zero, rad; meaningless if it is unzeroed."""
     speed: float
-    """Largest of the joint, rad/s."""
+    """Maximum speed of the joint, rad/s."""
     moved: float
-    """Largest way from the first sample to another, rad."""
+    """Maximum distance from the first sample, rad."""
     error: int
     """`AxisError` bits of both axes."""
     angles: Pair | None = None
-    """Its encoders' angles within the turn, turns; None: the drive does not tell."""
+    """Angles of its encoders within the turn, turns; None if the drive does not report them."""
     q_there: Pair = (0.0, 0.0)
     """`q` when the encoders were at these angles: a joint that is still may creep."""
 
@@ -134,21 +134,21 @@ def refusal(seen: DriveLook) -> str:
     if seen.status is DriveStatus.ARMED:
         return "its drive is armed (closed loop); make it idle first"
     if seen.error & AxisError.ENCODER_FAILED:
-        return "its drive reports an encoder error; repair that first (`xrl doctor`)"
+        return "its drive reports an encoder error; repair it first (see `xrl doctor`)"
     if seen.is_moving:
         return (
-            f"it moves: {seen.speed:.2f} rad/s, {seen.moved:.3f} rad in {LOOK_S:g} s; "
+            f"the joint moves: {seen.speed:.2f} rad/s, {seen.moved:.3f} rad in {LOOK_S:g} s; "
             "hold it still, and try again"
         )
     return ""
 
 
 def why_outside(robot: RobotConfig, module: str, q: Pair) -> str:
-    """Return which angle of (phi, theta), rad, is outside of a module's limits; "" if none."""
+    """Return which angle of (phi, theta), rad, is outside of a module's limits, or ""."""
     limit = getattr(robot.limits, kind_of(module))
     for axis, angle, (low, high) in zip(("phi", "theta"), q, (limit.phi, limit.theta), strict=True):
         if not low <= angle <= high:  # so that a NaN is outside
-            return f"{axis} {angle:g} rad is outside of {low:g} .. {high:g} rad: {limit.why}"
+            return f"{axis} {angle:g} rad is outside of {low:g} to {high:g} rad: {limit.why}"
     return ""
 
 
@@ -156,13 +156,13 @@ def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
     """Write both motors' positions for joint angles q, rad, to an idle drive in its own count.
 
     Returns:
-        The position read back, right or not (`is_right`); None if none came.
+        The position read back, right or not (`is_right`); None if no sample arrived.
     """
     mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
     m1, m2 = motor_from_joint(q, gear_ratio)
     back: Back | None = None
     for _ in range(ATTEMPTS):
-        # what came while others were looked at is read out: a bus whose own frames wait takes none
+        # empty the receive queue first: a bus with frames waiting there accepts none to send
         until = time.monotonic() + SETTLED_S
         while time.monotonic() < until:
             drive.read(_READ_S)
@@ -190,7 +190,7 @@ def is_right(back: Back | None, q: Pair) -> bool:
 
 
 class _Track:
-    """Where a joint has been, by the drive's own count, rad."""
+    """Range of a joint's positions, by the drive's own count, rad."""
 
     def __init__(self, q: Pair, now_s: float) -> None:
         self._now = self._low = self._high = self._still_at = np.array(q)
@@ -204,7 +204,7 @@ class _Track:
 
     @property
     def swing(self) -> Swing:
-        """Lowest and highest (phi, theta), from where it is now."""
+        """Lowest and highest (phi, theta), relative to its present position."""
         low, high = (self._low - self._now).tolist(), (self._high - self._now).tolist()
         return (low[0], low[1]), (high[0], high[1])
 
@@ -215,12 +215,12 @@ def watch(
     progress: Callable[[str], None],
     clock: Callable[[], float] = time.monotonic,
 ) -> dict[str, Swing]:
-    """Return how knees and hips have swung once all have and rest again, or after `WAIT_S`.
+    """Return the swings of knees and hips once all have swung and rest, or after `WAIT_S`.
 
     Args:
         drives: by module, idle, in their own counts.
         gear_ratio: N of the differential.
-        progress: takes what is missing, once a second.
+        progress: receives the missing swings once a second.
         clock: s.
 
     Raises:
@@ -234,7 +234,9 @@ def watch(
             if reading is None:
                 continue
             if reading.status in (DriveStatus.LOST, DriveStatus.ARMED):
-                raise DriveError(f"{module}: {reading.status.name} while its leg swings")
+                raise DriveError(
+                    f"{module}: its drive is {reading.status.name} while its leg swings"
+                )
             q, now = joint_from_motor(reading.pos_turns, gear_ratio), clock()
             tracks.setdefault(module, _Track(q, now)).move_to(q, now)
         missing = _missing(tracks, clock())

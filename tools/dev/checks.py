@@ -1,4 +1,4 @@
-"""What `./deploy/test` runs once the environment is there: lint, types, a test of every claim."""
+"""Lint, types and tests: the parts of `./deploy/test`, in an environment that exists."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ from typing import Final
 
 from shared.exceptions import FAULT_EXIT_CODE
 
-CHECKS: Final = (("ruff", "check"), ("ruff", "format", "--check"), ("mypy",))
+CHECKS: Final = (
+    ("ruff", "check"),
+    ("ruff", "format", "--check"),
+    ("mypy",),
+    ("python", "-m", "tools.dev.words"),
+)
 PYTEST: Final = ("pytest", "--durations=12", "--durations-min=2")
 CORES: Final = os.cpu_count() or 1
 LIVE: Final = (*PYTEST, "-m", "live and not wide", "tests/system")

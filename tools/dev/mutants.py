@@ -32,7 +32,7 @@ FILE: Final = ROOT / "tests" / "mutants.toml"
 LEAST_SHARE: Final = 0.95
 """Mutation score that is asked for: the share of mutants that fail a test."""
 SAMPLE: Final = "*__mutmut_13"
-"""The thirteenth mutant of every function that has so many: what CI runs."""
+"""CI runs the thirteenth mutant of every function that has at least thirteen."""
 DEAD: Final = frozenset(("killed", "timeout", "segfault"))
 UNTRIED: Final = "not checked"
 LINKED: Final = ("services", "shared", "tests", "tools", "deploy", "docs", "README.md")
@@ -54,7 +54,7 @@ class Group(Section, frozen=True):
 
 
 class Mutation(Section, frozen=True, order=True):
-    """What a mutant is."""
+    """One mutant."""
 
     function: str
     """As mutmut names it, such as `services.joint.differential.x_limit_torque`."""
@@ -78,7 +78,7 @@ class MutantsFile(Section, frozen=True):
 
 
 class _GroupResult(NamedTuple):
-    """What became of a group."""
+    """Result of a group."""
 
     counts: Counter[str]
     """Mutants by mutmut's word for what became of them."""

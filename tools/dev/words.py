@@ -23,7 +23,7 @@ PATTERNS: Final = (
     (r"\bfor ever\b", "forever, or say until when"),
     (r"\bat the (most|least)\b", "at most, at least"),
     (r"\b(is|are) no more\b|\bno more$", "has ended; no longer"),
-    (r"\bif (it|there) is none\b|\bof none\b|\bhas none\b", "None if ...; has no X"),
+    (r"\bof none\b|\bhas none\b", "None if ...; has no X"),
     (r"\bgoes on\b", "continues"),
     (r"\bstands in (the|a|its|this|that)\b", "is in"),
     (r"\b(is|are) to be\b", "must be, should be"),
@@ -37,7 +37,7 @@ PLACES: Final = ("README.md", "CONTRIBUTING.md", "docs/*.md", "services", "share
 _COMPILED: Final = tuple((re.compile(found, re.IGNORECASE), right) for found, right in PATTERNS)
 
 
-def findings(text: str) -> Iterator[tuple[int, str, str]]:
+def _findings(text: str) -> Iterator[tuple[int, str, str]]:
     """Yield line number, the words found and what to write, of a text."""
     for number, line in enumerate(text.splitlines(), 1):
         for pattern, right in _COMPILED:
@@ -46,7 +46,7 @@ def findings(text: str) -> Iterator[tuple[int, str, str]]:
                 yield number, found[0], right
 
 
-def files() -> Iterator[Path]:
+def _files() -> Iterator[Path]:
     """Yield every file that is looked through."""
     for place in PLACES:
         path = ROOT / place
@@ -56,10 +56,10 @@ def files() -> Iterator[Path]:
 def main() -> int:
     """Print every finding; a fault if there is one."""
     count = 0
-    for path in files():
+    for path in _files():
         if path == Path(__file__).resolve():
             continue
-        for number, found, right in findings(path.read_text(encoding="utf-8")):
+        for number, found, right in _findings(path.read_text(encoding="utf-8")):
             count += 1
             print(f"{path.relative_to(ROOT)}:{number}: {found.strip()!r}; write: {right}")
     print(f"{count} findings" if count else "words: none of the patterns is found")

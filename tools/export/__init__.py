@@ -1,1 +1,1 @@
-"""A run's record in the formats of others: tables, and bags of ROS 2."""
+"""A run's record in other formats: tables, and ROS 2 bags."""

@@ -1,4 +1,4 @@
-"""A run as a bag of ROS 2: what the gateway would have published, in an MCAP with CDR messages."""
+"""A run as a ROS 2 bag: the gateway's messages, in an MCAP file with CDR encoding."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ def write_bag(
     rate_hz: float,
     done: Callable[[float], None],
 ) -> int:
-    """Write a bag; return how many messages it has. Its times are the log's, ns since 1970.
+    """Write a bag; return its number of messages. Its times are the log's, ns since 1970.
 
-    `rate_hz` is that of joint states, transforms and wrench; `done` takes the s that are written.
+    `rate_hz` is that of joint states, transforms and wrench; `done` receives the written time, s.
     """
     if not TIME_FIRST_NS <= index.began_ns <= index.ended_ns <= TIME_LAST_NS:
         raise RunError(
             f"{index.path}: its times, {clock_time(index.began_ns)} to "
-            f"{clock_time(index.ended_ns)}, are beyond those of ROS 2, which end on 2038-01-19; "
-            "take --csv"
+            f"{clock_time(index.ended_ns)}, are outside the range of ROS 2, which ends on "
+            "2038-01-19; use --csv"
         )
     rates = {"joint_states_hz": rate_hz, "tf_hz": rate_hz, "wrench_hz": rate_hz}
     ros2 = msgspec.structs.replace(robot.ros2, **rates)
@@ -76,12 +76,12 @@ def write_bag(
                     writer.write(connections[outgoing.topic], unix_ns, outgoing.payload)
                     count += 1
     if not count:
-        raise RunError(f"{index.path}: has no message for a bag in this part; {SEE_INFO}")
+        raise RunError(f"{index.path}: no message for a bag in this part; {SEE_INFO}")
     return count
 
 
 def _in_order(log: RunLog) -> Iterator[tuple[int, Topic, str, Message]]:
-    """Yield time, key and message of what the gateway receives, in the order of time."""
+    """Yield time, key and message of the gateway's inputs, in order of time."""
     keys = [(t, m) for t in INPUTS for m in (MODULES if t.per_module else ("",))]
     streams = [
         sorted(

@@ -1,6 +1,6 @@
-"""A run as CSV tables: each key with all of its messages, or all on one time grid.
+"""A run as CSV tables: one per key with all of its messages, or one on a time grid.
 
-A column is a field, or an element of one: `tau_ff[1]`, as viewers of the log name it. In a table of
+A column is a field, or an element of a field: `tau_ff[1]`, as in viewers of the log. In a table of
 one key, `time_s` is the sender's stamp on the report's axis (`stamped`).
 """
 
@@ -26,19 +26,19 @@ from tools.logs.run_log import SEE_INFO, NewestAt, RunLog, RunPart, parts_of
 from tools.topic_keys import TopicKey
 
 _CLOCK_NS: Final = NS_PER_S
-"""A stamp that is further from its reception is of another clock."""
+"""A stamp that differs more from its reception is on another clock."""
 TIME: Final = "time_s"
 GRID_NAME: Final = "run.csv"
-"""File of the table on a grid."""
+"""File name of the table on a grid."""
 HELD_S: Final = 0.5
-"""Newest messages that are older leave a grid's cells empty: their sender is silent."""
+"""Cells of a grid stay empty if the newest message is older than this, s: its sender is silent."""
 
 _HEAD: Final = ("t_ns", "seq")
-"""Fields that come first."""
+"""First fields."""
 FOR_REEXECUTION: Final = (topics.JOINT_TRACE, topics.PLANNER_CHECKPOINT, topics.SIM_STATE)
 
 Columns = Mapping[str, Sequence[Any]]
-"""Values by name, all of one length; None: an empty cell."""
+"""Values by name, all of the same length; None for an empty cell."""
 
 
 Reader: TypeAlias = Callable[[Any], Any]
@@ -46,7 +46,7 @@ Reader: TypeAlias = Callable[[Any], Any]
 
 
 class _CsvFile:
-    """A CSV file."""
+    """A CSV file that is being written."""
 
     def __init__(self, path: Path, columns: Iterable[str]) -> None:
         self._file = path.open("w", newline="", encoding="utf-8")
@@ -58,7 +58,7 @@ class _CsvFile:
         self._writer.writerows(zip(*columns.values(), strict=True))
 
     def close(self) -> None:
-        """Finish it."""
+        """Finish the file."""
         self._file.close()
 
 
@@ -67,9 +67,9 @@ def stamped(
 ) -> Iterator[tuple[int, Any]]:
     """Yield time, monotonic ns of the recorder's clock, and message of a key.
 
-    The time is the sender's stamp. Where that is more than a second off, because the sender is on
-    another host or had none yet, it is the reception, which is up to 40 ms late. `margins` are the
-    messages before and behind the part.
+    The time is the sender's stamp. If that is more than a second off, because the sender is on
+    another host or had no stamp yet, it is the reception, which is up to 40 ms late. `margins` are
+    the messages before and after the part.
     """
     received = log.received_ns(topic, module)
     for at_ns, message in zip(received, log.messages(topic, module), strict=True):
@@ -94,9 +94,9 @@ def write_tables(
     folder: Path,
     done: Callable[[float], None],
 ) -> dict[str, int]:
-    """Write a file for each key that has messages; return the rows of each file.
+    """Write a file for each key with messages; return the number of rows of each file.
 
-    `done` takes the s that are written.
+    `done` receives the written time, s.
     """
     zero = zero_ns(index)
     open_files: dict[str, _CsvFile] = {}
@@ -131,13 +131,13 @@ def write_grid(
     path: Path,
     done: Callable[[float], None],
 ) -> int:
-    """Write one table on a grid of time: at each time the newest message of each key.
+    """Write one table on a time grid, with the newest message of each key at each time.
 
     Topics of events, which have no rate, are left out. Returns the number of rows.
     """
     steady = [key for key in keys if key.topic.rate_hz]
     if not steady:
-        raise RunError("--rate: none of these topics has a rate; leave it out for their events")
+        raise RunError("--rate: none of these topics has a rate; remove --rate for their events")
     readers = {key.topic: columns_of(key.topic.type) for key in steady}
     names = [f"{key.name}.{name}" for key in steady for name in readers[key.topic]]
     zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
@@ -158,7 +158,7 @@ def write_grid(
                 file.add(cells)
             count += len(grid)
     if not heard:
-        raise RunError(f"{index.path}: has no message of these topics in this part; {SEE_INFO}")
+        raise RunError(f"{index.path}: no message of these topics in this part; {SEE_INFO}")
     return count
 
 
@@ -174,7 +174,7 @@ def _newest_at(log: RunLog, key: TopicKey, grid: Iterable[int]) -> list[Any | No
 
 
 def _add_column(found: dict[str, Reader], name: str, kind: Any, read: Reader) -> None:
-    """Add a field's column, or those of its elements; any other value becomes JSON."""
+    """Add a field's column, or the columns of its elements; any other value becomes JSON."""
     elements = get_args(kind)
     if kind in (int, float, bool, str):
         found[name] = read

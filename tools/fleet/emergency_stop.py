@@ -1,4 +1,4 @@
-"""Emergency stop: by shared memory on this host, and over the bus to all six modules."""
+"""Emergency stop: through shared memory on this host, and over the bus to all six modules."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from shared.places import user_name
 from tools.fleet import procfs
 
 REPEAT_S: Final = 0.05
-"""The bus may drop a message: the stop is repeated until all six have stopped."""
+"""Period of the stop message, s. The bus may drop one, so it repeats until all six have stopped."""
 GIVE_UP_S: Final = 3.0
 UNHEARD_S: Final = 0.5
-"""A module whose last state is older is not heard."""
+"""A module is silent if its last state is older than this, s."""
 STOPPED: Final = (Mode.DAMP, Mode.FAULT)
 
 
 def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
-    """Request a stop by shared memory from the services on this host.
+    """Request a stop through shared memory from the services on this host.
 
-    A service whose memory has no file any more, as on a disk that vanished, is asked by SIGUSR1.
+    A service whose shared-memory file is gone, for example with its disk, receives SIGUSR1.
 
     Returns:
-        The modules that received it, and one line for each that could not or cannot confirm it.
+        The modules that received it, and a line for each that could not or cannot confirm it.
     """
     here, errors = [], []
     processes: dict[str, int] | None = None
@@ -46,12 +46,12 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
                 here.append(module)
                 continue
         except OSError as error:
-            errors.append(f"{module}: no stop by shared memory: {error.strerror}")
+            errors.append(f"{module}: no stop through shared memory: {error.strerror}")
         processes = procfs.service_pids(run_dir) if processes is None else processes
         if module in processes:
             procfs.signal_all([processes[module]], signal.SIGUSR1)
             errors.append(
-                f"{module}: its shared memory is gone: stop requested by SIGUSR1, unconfirmed"
+                f"{module}: its shared memory is gone: stop requested with SIGUSR1, unconfirmed"
             )
     return here, errors
 
@@ -60,7 +60,7 @@ def wait_here(run_dir: Path, here: list[str], wanted: Sequence[str] = MODULES) -
     """Wait until the services on this host have stopped."""
     deadline, going = time.monotonic() + GIVE_UP_S, list(here)
     while going and time.monotonic() < deadline:
-        # one that has stopped stays so: it is not asked again, as its row might be half written
+        # a stopped module stays stopped; it is not read again, since its row might be half written
         going = [module for module in going if not _is_stopped(run_dir, module)]
         if going:
             time.sleep(REPEAT_S)
@@ -69,10 +69,10 @@ def wait_here(run_dir: Path, here: list[str], wanted: Sequence[str] = MODULES) -
 
 
 class BusStop:
-    """The way over the bus, on a session that is open: nothing is dialled when it is asked for."""
+    """The stop over the bus, on an open session, so that stopping needs no new connection."""
 
     def __init__(self, robot: RobotConfig, session: Session, here: Path | None) -> None:
-        """Subscribe; `here` is the run directory of this robot's services on this host, if any."""
+        """Subscribe; `here` is the run directory of this robot's services on this host, or None."""
         self._robot, self._here = robot, here
         self._publisher = session.publisher(topics.ESTOP, Estop)
         self._states = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
@@ -81,7 +81,7 @@ class BusStop:
         self._seq = 0
 
     def listen(self) -> list[str]:
-        """Receive the modules' states; return those that were not heard just now."""
+        """Receive the modules' states; return the silent modules."""
         now_s = time.monotonic()
         for module, latest in self._states.items():
             state = latest.take()
@@ -92,7 +92,7 @@ class BusStop:
     def stop(self) -> list[str]:
         """Publish the stop until all six modules have stopped; return each that has not.
 
-        What was heard before does not count: a module may be silent since.
+        States from before do not count, because a module may have become silent since.
         """
         self.listen()
         self._modes.clear()
@@ -107,7 +107,7 @@ class BusStop:
         failed = [f"{module} {modes.get(module, 'silent')}" for module in going]
         if failed and self._robot.bus.security.mode == "mtls":
             name = read_credentials(self._robot, "estop").name
-            failed += [] if name == topics.OPERATOR else [f"this host has the key of a {name} only"]
+            failed += [] if name == topics.OPERATOR else [f"this host has only the key of a {name}"]
         return failed
 
     def _has_stopped(self, module: str) -> bool:
@@ -116,19 +116,19 @@ class BusStop:
 
 
 def stop_all(robot: RobotConfig, run_dir: Path, *, here: bool) -> list[str]:
-    """Stop over the bus, in a new session; `here`: its services are in this run directory."""
+    """Stop over the bus in a new session; `here`: this run directory holds the robot's services."""
     with open_session(robot, "estop", run_dir) as session:
         return BusStop(robot, session, run_dir if here else None).stop()
 
 
 def refuse_going(going: list[str]) -> None:
-    """Say that these have not stopped, if there are any."""
+    """Raise a FleetError that names the modules that have not stopped, if any."""
     if going:
         raise FleetError(f"not stopped after {GIVE_UP_S:g} s: {', '.join(going)}; cut the power")
 
 
 def _source() -> str:
-    """Return who asks for the stop; never raises: nothing may keep a stop from going out."""
+    """Return who requests the stop; never raises, because nothing may prevent a stop."""
     text = f"xrl estop by {user_name()} on {platform.node()}"
     return text.encode(errors="replace").decode()
 

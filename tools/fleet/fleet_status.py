@@ -1,4 +1,4 @@
-"""What `xrl status` knows: every service by its supervisor and by its messages, every module."""
+"""Fleet status for `xrl status`: each service by its supervisor and messages, and each module."""
 
 from __future__ import annotations
 
@@ -50,22 +50,22 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.fleet.supervisor_client import ServiceInfo
 
 TIERS: Final = {Mode.TRACK: 1, Mode.HOLD: 2}
-"""Who holds a module up: the planner (1) or its joint service alone (2). In every other
-mode the joint service does not, and the mode says why."""
+"""Tier that holds a module up: the planner (1) or its joint service alone (2). In every other
+mode neither does, and the mode says why."""
 
 PLANNER: Final = "planner"
 ROSTER: Final = "tools"
-"""Whom the recorder hears of; no service has this name."""
-SILENT_PROXY: Final = "not known: the network proxy does not answer"
+"""Source of the recorder's roster of tools; no service has this name."""
+SILENT_PROXY: Final = "unknown: the network proxy does not answer"
 
-OPEN: Final = "bus.security.mode is open: anyone who reaches its ports commands this robot"
+OPEN: Final = "bus.security.mode is open: anyone who reaches its ports can command this robot"
 
 _LINKS_S: Final = 1.0
-"""Longest wait for the first message of each service."""
+"""Timeout for the first message of each service, s."""
 _WINDOW_S: Final = 0.5
-"""Time over which rates are counted."""
+"""Window over which rates are counted, s."""
 _FRESH_S: Final = 1.0
-"""An older message is history: its sender is dead, suspended or cut off."""
+"""An older message is stale, s: its sender is dead, suspended or cut off."""
 _POLL_S: Final = 0.002
 _PROBES_AT_ONCE: Final = 16
 
@@ -74,20 +74,20 @@ class ServiceStatus(ServiceInfo, frozen=True):
     """One service, by its supervisor and by its messages."""
 
     age_s: float | None = None
-    """Age of its newest message; None if none has come, or it publishes none steadily."""
+    """Age of its newest message; None if none has arrived, or if it publishes none steadily."""
     rate_hz: float | None = None
     """Its messages per second, by their sequence numbers; None as for `age_s`."""
     real_time: bool | None = None
-    """It has a real-time priority; None if it does not run, or is to have none."""
+    """True if it has real-time priority; None if it does not run, or needs no such priority."""
 
 
 class RefusedCommands(msgspec.Struct, frozen=True):
-    """Commands of one sender that a module refuses for one cause."""
+    """Commands of one sender that a module refuses for the same cause."""
 
     cause: str
     """Name of the `Refusal`."""
     session: int
-    """Session of the planner that sends them; 0: they are no commands."""
+    """Session of the planner that sends them; 0 if they are not commands."""
     hz: float
     """Commands per second."""
 
@@ -96,31 +96,31 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     """One module, by the newest state of its joint service."""
 
     mode: str | None = None
-    """Name of its `Mode`; None if its joint service sends nothing now."""
+    """Name of its `Mode`; None if its joint service is silent."""
     tier: int | None = None
-    """See `TIERS`; None in every other mode."""
+    """See `TIERS`; None in other modes."""
     cause: str | None = None
     """Name of the `Cause` of its last change of mode."""
     drive: str | None = None
     """Name of the `DriveStatus` of its drive."""
     q: Pair | None = None
-    """(phi, theta), rad; None if its drive does not know."""
+    """(phi, theta), rad; None if its drive does not know them."""
     way_out: str = ""
     """Remedy that lets it track again; empty if none is needed."""
     stiffened: bool = False
-    """It holds with all of its stand gains, because another may be limp."""
+    """True if it holds with its full stand gains, because another module may be limp."""
     outside: str = ""
     """Name of the refused part of the newest command (`Outside`); empty if it is accepted."""
     session: int = 0
-    """Session of the planner whose commands it uses; 0 if there is none."""
+    """Session of the planner whose commands it uses, or 0."""
     refusals: tuple[RefusedCommands, ...] = ()
     """Commands that it refuses now, by cause and sender."""
     stopped_by: str = ""
-    """Who engaged the emergency stop that holds, if its service is on this host."""
+    """Person and host that engaged the active emergency stop, if the service is on this host."""
     celsius: tuple[float, float] | None = None
-    """Estimated temperature of both windings, C; None: not estimated."""
+    """Estimated temperature of both windings, C; None if not estimated."""
     heat_left_s: float | None = None
-    """Seconds left at this load, 3600 for an hour or more; None: not estimated."""
+    """Seconds left at this load, 3600 for an hour or more; None if not estimated."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
@@ -129,52 +129,52 @@ class LeadStatus(msgspec.Struct, frozen=True):
     mode: str
     """Name of its `PlannerMode`."""
     wait_s: float
-    """Until it may lead again after drop-outs, s."""
+    """Remaining back-off until it may lead again after dropouts, s."""
     margin: float
     """Margin of the gains by the failsafe certificate; 1 is required."""
     why: str = ""
-    """Why it does not lead, in words, where the mode does not say it all."""
+    """Reason why it does not lead, in words, where the mode does not explain it."""
     session: int = 0
     carried_n: float = 0.0
-    """What the robot carries of payload and person now, N, as in `PlannerStatus`."""
+    """Weight of payload and person that the robot carries now, N, as in `PlannerStatus`."""
     wearer: str = ""
-    """What it makes of the person, in words (`services.planner.watch.park`); empty if they lead."""
+    """Wearer's state seen by the planner (`services.planner.watch.park`); empty if they lead."""
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
-    """What `xrl status --json` prints."""
+    """The output of `xrl status --json`."""
 
     run_dir: str
     config: str
     services: dict[str, ServiceStatus]
     modules: dict[str, ModuleStatus]
     lead: LeadStatus | None = None
-    """None if no planner sends a status now."""
+    """None if no planner is sending its status."""
     network: tuple[str, ...] = ()
     """Active impairments of the network proxy, as text."""
     pace: float = 1.0
-    """How fast the fleet's clock goes; below 1 it is in slow motion."""
+    """Rate of the fleet's clock; below 1 is slow motion."""
     security: str = "local"
     """`bus.security.mode` of the robot file."""
     tools: tuple[str, ...] = ()
-    """Tools that are linked beside this one, each as NAME.HOST.PID, as it names itself."""
+    """Other tools with a link, each by its own NAME.HOST.PID."""
     trouble: tuple[str, ...] = ()
-    """What is wrong with supervision, logs and disk, a line each."""
+    """Faults of supervision, logs and disk, one line each."""
     bus_faults: tuple[str, ...] = ()
     """Under `mtls`: links that TLS refuses, in words."""
 
     @property
     def exit_code(self) -> int:
-        """`FELL_EXIT_CODE` if the planner says that the robot has fallen, else 0."""
+        """`FELL_EXIT_CODE` if the planner reports that the robot has fallen, else 0."""
         fell = self.lead is not None and self.lead.mode == PlannerMode.FALLEN.name
         return FELL_EXIT_CODE if fell else 0
 
 
 class RateMonitor:
-    """Listens to one service: newest message, first and last of the present window.
+    """Receives from one service: the newest message, and the first and last of the current window.
 
-    How old that is goes by its arrival: its stamp is of its sender's clock, which may be another
-    host's.
+    The age counts from the arrival, because the stamp is on the sender's clock, which may be that
+    of another host.
     """
 
     def __init__(self, latest: Latest[Message]) -> None:
@@ -198,21 +198,21 @@ class RateMonitor:
         self.newest, self._heard_ns = message, now_ns()
 
     def new_window(self) -> None:
-        """Count the rates from here on."""
+        """Start a new window for the rates."""
         self._first = self.newest
         self._refused.clear()
 
     def age_s(self) -> float | None:
-        """Return the time since the newest message came."""
+        """Return the time since the newest message arrived."""
         return None if self.newest is None else (now_ns() - self._heard_ns) / NS_PER_S
 
     def is_fresh(self) -> bool:
-        """Return True if the newest message still says how things are."""
+        """Return True if the newest message is not stale."""
         age_s = self.age_s()
         return age_s is not None and age_s < _FRESH_S
 
     def refusals(self) -> tuple[RefusedCommands, ...]:
-        """Return the commands refused in this window; none for other services than joints."""
+        """Return the commands refused in this window; empty for services other than joints."""
         first, newest = self._first, self.newest
         if first is None or newest is None or newest.t_ns <= first.t_ns:
             return ()
@@ -224,7 +224,7 @@ class RateMonitor:
         )
 
     def rate_hz(self) -> float | None:
-        """Return messages per second in this window; 0 if none has come in it."""
+        """Return the messages per second in this window, 0 without a new one, None without any."""
         if self._first is None or self.newest is None:
             return None
         span_ns = self.newest.t_ns - self._first.t_ns
@@ -232,7 +232,7 @@ class RateMonitor:
 
 
 class BusFaults:
-    """Looks at the links that this host's services, and this tool, dial over TLS."""
+    """Checks the links that this host's services, and this tool, dial over TLS."""
 
     def __init__(self, robot: RobotConfig, session: Session) -> None:
         self._robot, self._session = robot, session
@@ -240,7 +240,7 @@ class BusFaults:
         self._here = security.services_here(robot)
 
     def describe(self, pids: dict[str, int]) -> tuple[str, ...]:
-        """Return what is wrong, in words; takes up to 2 s if a link does not come."""
+        """Return the faults, in words; takes up to 2 s if a link does not answer."""
         if self.mode != "mtls":
             return ()
         links = list(self._missing(pids))
@@ -263,7 +263,7 @@ class BusFaults:
             yield f"no link over TLS: certificate of {', '.join(names)} {fault}"
 
     def _missing(self, pids: dict[str, int]) -> Iterator[tuple[str, Credentials, str, str]]:
-        """Return who dials, as whom, which peer and where, for each link that is not there."""
+        """Yield who dials, with which credentials, which peer and where, for each missing link."""
         alive = self._session.alive()
         for dials, pid in (*pids.items(), (self._session.name, None)):
             if pid is not None and dials not in SERVICES:
@@ -276,7 +276,7 @@ class BusFaults:
                     continue
                 try:
                     yield dials, read_credentials(self._robot, dials), peer, endpoint
-                except BusError:  # its own log tells
+                except BusError:  # the log of the service reports it
                     break
 
 
@@ -288,7 +288,7 @@ def _is_in(endpoint: str, linked: Collection[tuple[str, int]]) -> bool:
 
 
 def monitors_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMonitor]:
-    """Return a monitor of each service that publishes steadily; modules may be on other hosts."""
+    """Return a monitor per service that publishes steadily; modules may be on other hosts."""
     elsewhere = dict.fromkeys(MODULES, JOINT_STATE.name) | {
         PLANNER: PLANNER_STATUS.name, ROSTER: TOOLS.name,
     }  # fmt: skip
@@ -303,7 +303,7 @@ def monitors_of(session: Session, topics: Mapping[str, str]) -> dict[str, RateMo
 
 
 def listen_for_all(monitors: Mapping[str, RateMonitor]) -> None:
-    """Wait for a first message of each, but not for long."""
+    """Wait for the first message of each service, with a short timeout."""
     _listen(monitors, _LINKS_S, until=lambda: all(monitor.newest for monitor in monitors.values()))
 
 
@@ -314,7 +314,7 @@ def read_status(
     for monitor in monitors.values():
         monitor.new_window()
     _listen(monitors, _WINDOW_S)
-    # before the call to the supervisor, which takes a while on a busy machine
+    # before the call to the supervisor, which is slow on a busy machine
     present = {name: (monitor.age_s(), monitor.rate_hz()) for name, monitor in monitors.items()}
     newest = {name: one.newest if one.is_fresh() else None for name, one in monitors.items()}
     infos = fleet.info()
@@ -349,7 +349,7 @@ def _service_status(
 
 
 def _is_read_only(folder: Path) -> bool:
-    """Return True if a disk takes no file; a nameless file tells, mount options may not."""
+    """Return True if a disk rejects a new file; an unnamed file shows it, mount options may not."""
     try:
         os.close(os.open(folder, os.O_TMPFILE | os.O_WRONLY, 0o600))
     except OSError as error:
@@ -360,19 +360,19 @@ def _is_read_only(folder: Path) -> bool:
 def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tuple[str, ...]:
     fault = fleet.supervision_fault()
     lines = [fault] if fault else []
-    lost, why = (0, "") if fault else fleet.lost_lines()  # it would only be waited for again
+    lost, why = (0, "") if fault else fleet.lost_lines()  # with a fault this would time out too
     if lost:
         lines.append(f"{lost} log lines are lost: {why}: {fleet.run.logs}")
     if not os.access(fleet.run.live, os.W_OK):
         lines.append(
             f"{fleet.run.live}: read-only or missing: a service that ends cannot restart; hang the "
-            "robot, then `xrl down`"
+            "robot, then run `xrl down`"
         )
     if _is_read_only(fleet.run.path):
         lines.append(
             f"{fleet.run.path}: its disk is read-only: logs and records on it are lost. "
             "Services still restart, but a new fleet does not start: hang the robot, "
-            "`xrl down`, then mend the disk"
+            "run `xrl down`, then repair the disk"
         )
     try:
         free_mib = free_mib_at(fleet.run.path)
@@ -384,7 +384,7 @@ def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tupl
     return (
         *lines,
         *(
-            f"{row.name}: {row.last_exit}, start {row.restarts + 1} so far; {row.last_line}"
+            f"{row.name}: {row.last_exit}, {row.restarts + 1} starts so far; {row.last_line}"
             for row in services
             if row.state in ("backoff", "starting") and row.last_exit
         ),
@@ -392,7 +392,7 @@ def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tupl
 
 
 def _real_time(service: ServiceInfo) -> bool | None:
-    """Return whether a running service that is to have a real-time priority was given one."""
+    """Return whether a running service that needs real-time priority has it, else None."""
     wanted = service.name in MODULES or service.name in scheduling.TABLE
     running = service.pid is not None and service.state == "running"
     return scheduling.has_real_time(service.pid) if wanted and running and service.pid else None
@@ -450,7 +450,7 @@ def _lead_status(message: Message | None) -> LeadStatus | None:
 
 
 def _tools_of(message: Message | None) -> tuple[str, ...]:
-    """Return the tools that are linked, but for this process, from the recorder's newest roster."""
+    """Return the linked tools from the recorder's newest roster, except this process."""
     own = f".{place_of_tool()}"
     if not isinstance(message, ToolRoster):
         return ()

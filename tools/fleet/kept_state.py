@@ -1,8 +1,8 @@
-"""State of the joint services that outlasts a power cut: emergency stops and temperatures.
+"""State of the joint services that survives a power cut: emergency stops and temperatures.
 
-The services write it to memory in the live directory only: a store to a mapped file on a failing
-disk can end the process (SIGBUS). The supervisor copies it to the run directory every 5 s, and the
-next start takes it from there. A disk that takes no writing costs only the copy.
+The services write it only to memory in the live directory, because a store to a mapped file on a
+failing disk can end the process (SIGBUS). The supervisor copies it to the run directory every 5 s,
+and the next start reads it there. A disk that rejects writes costs only the copy.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ HEAT: Final = "*.heat"
 
 
 def save(run_dir: Path) -> bool:
-    """Copy what has changed from the live directory to the run directory; False if it cannot be."""
+    """Copy changes from the live directory to the run directory; False if that fails."""
     return _copy(live_dir(run_dir), run_dir, replace=True)
 
 
 def restore(run_dir: Path) -> None:
-    """Copy what the live directory lacks, as after a power cut, from the run directory."""
+    """Copy from the run directory what the live directory lacks, as after a power cut."""
     _copy(run_dir, live_dir(run_dir), replace=False)
 
 
@@ -43,6 +43,6 @@ def _copy(source: Path, target: Path, *, replace: bool) -> bool:
 
 
 def forget_stops(run_dir: Path) -> None:
-    """Remove the emergency stops from the run directory; OSError if the disk refuses."""
+    """Remove the emergency stops from the run directory; OSError if the disk rejects it."""
     for file in run_dir.glob(STOPS):
         file.unlink(missing_ok=True)

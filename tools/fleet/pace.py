@@ -1,4 +1,4 @@
-"""Slow motion: the pace of a simulated fleet's clock on cores that are too slow for real time."""
+"""Slow motion: a slower clock for a simulated fleet whose cores are too slow for real time."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from tools.flags import Arg, Flags
 T = TypeVar("T")
 
 PACE_VARIABLE: Final = "XRL_PACE"
-"""Environment variable: default pace of a simulated fleet."""
+"""Environment variable with the default pace of a simulated fleet."""
 PACE_MIN: Final = 0.1
 SLOWER: Final = 0.6
-"""Factor on the pace when the cores are full."""
+"""Factor on the pace if the cores are full."""
 IDLE_LEAST: Final = 0.08
-"""Below this idle fraction while the robot stands before the scenario, the cores count as full.
+"""The cores count as full below this idle fraction, while the robot stands before the scenario.
 A fleet in real time leaves about 0.25."""
 
 
 class CoresFullError(FleetError):
-    """The cores have no time left beside a fleet that stands, or that does not come to stand."""
+    """The cores are full while the fleet stands, or the fleet does not get to stand."""
 
 
 class PaceFlags(Flags):
-    """How fast the clock of a simulated fleet goes."""
+    """Clock rate of a simulated fleet."""
 
     pace: Annotated[
         float | None,
@@ -52,15 +52,15 @@ def usual_pace() -> float:
 
 
 def check_pace(pace: float, *, simulated: bool) -> None:
-    """Refuse a pace that cannot be kept."""
+    """Refuse a pace that is out of range, or not 1 on a real robot."""
     if not PACE_MIN <= pace <= 1.0:
-        raise FleetError(f"--pace {pace:g}: {PACE_MIN:g} to 1 is right")
+        raise FleetError(f"--pace {pace:g}: must be between {PACE_MIN:g} and 1")
     if pace != 1.0 and not simulated:
-        raise FleetError(f"--pace {pace:g}: only a simulated fleet has slow motion; leave it out")
+        raise FleetError(f"--pace {pace:g}: only a simulated fleet has slow motion; remove --pace")
 
 
 def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) -> T:
-    """Run at the default pace, and again at a slower one while the cores are full."""
+    """Run at the default pace; restart at a slower one as long as the cores are full."""
     while True:
         pace = usual_pace()
         try:
@@ -70,7 +70,7 @@ def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) 
             if slower < PACE_MIN:
                 raise
             os.environ[PACE_VARIABLE] = f"{slower:g}"
-            tell(f"{error}; starting again in slow motion, at {slower:g}")
+            tell(f"{error}; restarting in slow motion, at {slower:g}")
 
 
 def idle_share(before: tuple[int, int]) -> float:
@@ -80,9 +80,9 @@ def idle_share(before: tuple[int, int]) -> float:
 
 
 def idle_and_total() -> tuple[int, int]:
-    """Return the idle and all ticks of every core since the machine started.
+    """Return the idle ticks and all ticks of every core since the machine started.
 
-    What is niced counts as idle: it gives way to a fleet that is not.
+    Time of niced processes counts as idle, because they yield to a fleet that is not niced.
     """
     fields = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()[1:]
     ticks = [int(field) for field in fields]

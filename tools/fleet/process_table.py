@@ -1,4 +1,4 @@
-"""Which processes make up the fleet, and whether they can be started here.
+"""Selects the processes of the fleet, and checks whether they can start here.
 
 The table is `deploy/processes.toml`; `tools.fleet.supervise` runs what this file selects.
 """
@@ -34,17 +34,17 @@ TABLE = FILES / "processes.toml"
 """The process table of this checkout."""
 
 PYTHON, CONFIG, MODULE = "{python}", "{config}", "{module}"
-"""Placeholders of the table, beside that of the run directory."""
+"""Placeholders of the table, besides that of the run directory."""
 
 SIMULATED_CAN = "xrl_unix"
-"""python-can interface of the emulated drives: the robot is a simulated one."""
+"""python-can interface of the emulated drives; it marks a simulated robot."""
 
 SUPERVISOR_SOCKET = "supervisor.sock"
 """Name of the supervisor's own socket in the live directory."""
 
 UNIX = "unixsock-stream/"
 """Prefix of a bus endpoint on a UNIX socket."""
-_ELSEWHERE = "an address of another host (`--only` starts the services of this one)"
+_ELSEWHERE = "an address of another host (`--only` starts only the services of this host)"
 
 
 class Process(Section, frozen=True):
@@ -66,21 +66,21 @@ class Process(Section, frozen=True):
     """Arguments with the placeholders {python}, {config}, {run} and {module}."""
     autostart: bool
     ready: Literal["endpoint", "running"]
-    """Up once it listens on its bus endpoint, or once it has lived for `settle_s`."""
+    """Ready once it listens on its bus endpoint, or once it has run for `settle_s`."""
     stop_signal: Literal["TERM", "INT"]
     stop_s: Annotated[int, Range(1, 60, "s")]
     """Time from the stop signal to SIGKILL."""
     settle_s: Annotated[int, Range(1, 60, "s")]
-    """A start that ends sooner has failed, and the next one is delayed."""
+    """A start that ends sooner has failed, and the next start is delayed."""
     why: str
     only: Literal["", "simulation", "injected", "imu", "ros2", "named"] = ""
     """`simulation`: not started where the drives are real; `injected`: only where the network is
-    to be impaired; `imu`: only on a robot that has one; `ros2`: only where ROS 2 is to see it;
-    `named`: only where it is asked for by name."""
+    impaired; `imu`: only on a robot with an IMU; `ros2`: only where ROS 2 sees the robot;
+    `named`: only if requested by name."""
     extra: str = ""
-    """Extra of pyproject.toml whose packages it needs."""
+    """Extra of pyproject.toml with the packages that it needs."""
     topic: str = ""
-    """Topic that it publishes steadily, as in `shared.bus.topics`; empty if there is none."""
+    """Topic that it publishes steadily, as in `shared.bus.topics`, or an empty string."""
 
 
 class _ProcessTable(Section, frozen=True):
@@ -96,43 +96,43 @@ class ListenPoint(NamedTuple):
 
     service: str
     key: str
-    """Where it stands in the robot file."""
+    """Its key in the robot file."""
     endpoint: str
-    """As Zenoh writes it: unixsock-stream/PATH or tcp/HOST:PORT."""
+    """In Zenoh's notation: unixsock-stream/PATH or tcp/HOST:PORT."""
 
 
 class FleetOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How a fleet is started, beside its robot file and its run directory."""
+    """Options of a fleet's start, besides its robot file and its run directory."""
 
     services: Collection[str] | None = None
-    """To start, whatever their rows say; None for all that the table starts by default."""
+    """Services to start, whatever their rows say; None for all that the table starts by default."""
     not_started: Collection[str] = ()
-    """Those that wait for `SupervisedFleet.start_service`."""
+    """Services that wait for `SupervisedFleet.start_service`."""
     overrides: Mapping[str, Sequence[str]] = {}
-    """Further arguments of some services."""
+    """Additional arguments of some services."""
     no_restart: Collection[str] = ()
     """Services that stay down when they end."""
     simulation: bool = True
-    """False leaves the simulator out; where all drives are real it always is."""
+    """False leaves the simulator out; it is always left out where all drives are real."""
     injected: bool = False
-    """With the network proxy on the links of planner, joints and sensors."""
+    """Route the links of planner, joints and sensors through the network proxy."""
     ros2: bool = False
-    """With the gateway to ROS 2."""
+    """Start the gateway to ROS 2."""
     pace: float | None = None
     """Clock rate of a simulated fleet; None: `usual_pace` if it is simulated, else 1."""
     leashed: bool = False
     """Stop the fleet if this process or the supervisor dies."""
     disarmed: bool = False
-    """No person asks for this start. It arms no drive, takes those over that hold, and keeps an
-    emergency stop and the logs of what ended. If a service does not come up it ends nothing, which
-    would idle the drives of the others: the supervisor keeps trying."""
+    """Start without a person's request. It arms no drive, takes over holding drives, and keeps an
+    emergency stop and the logs of ended services. If a service fails to start, no other is ended,
+    since that would idle their drives; the supervisor keeps trying."""
     table_path: Path = TABLE
     timeout_s: float = 30.0
-    """Time without progress after which the start has failed (`supervise.START_MAX_S`)."""
+    """Time without progress after which the start fails (`supervise.START_MAX_S`), s."""
 
 
 class FleetPlan(NamedTuple):
-    """A fleet that is to be started."""
+    """A fleet before its start."""
 
     config_path: Path
     """The robot file, absolute."""
@@ -143,7 +143,7 @@ class FleetPlan(NamedTuple):
     listeners: tuple[ListenPoint, ...]
     environment: dict[str, str]
     emulated_usb: bool = False
-    """The services look for their drives on USB, and find emulated ones there."""
+    """The services search USB for their drives, and find emulated ones."""
 
 
 def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetPlan:
@@ -184,13 +184,13 @@ def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetP
 def _selected(
     table: _ProcessTable, config: RobotConfig, options: FleetOptions
 ) -> tuple[Process, ...]:
-    """Return the rows of a fleet; refuse a name that the table or this fleet does not have."""
+    """Return the rows of a fleet; refuse a name that the table or this fleet lacks."""
     services, named = options.services or (), options.services is not None
     check_known(services, [row.name for row in table.process])
     if "imu" in services and not config.imu.fitted:
-        raise FleetError("imu: this robot has none; `fitted` of [imu] in the robot file says so")
+        raise FleetError("imu: this robot has no IMU (`fitted` of [imu] in the robot file)")
     if "ros2_gateway" in services and not options.ros2:
-        raise FleetError("ros2_gateway: it is started with --ros2; add that")
+        raise FleetError("ros2_gateway: it starts only with --ros2; add --ros2")
     wanted = {
         "": True, "simulation": options.simulation and is_simulated(config), "named": named,
         "injected": options.injected, "imu": config.imu.fitted, "ros2": options.ros2,
@@ -208,7 +208,7 @@ def _selected(
 
 
 def load_table(path: Path = TABLE) -> _ProcessTable:
-    """Read the process table, with one row for each service: `{module}` rows are six."""
+    """Read the process table with one row per service: a `{module}` row becomes six."""
     table = read_toml(path, _ProcessTable)
     rows: list[Process] = []
     for index, row in enumerate(table.process):
@@ -226,12 +226,12 @@ def load_table(path: Path = TABLE) -> _ProcessTable:
     names = [row.name for row in rows]
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(str(path), "process", f"{name!r} stands twice", "each service once")
+            raise ConfigError(str(path), "process", f"{name!r} is in it twice", "each service once")
     return msgspec.structs.replace(table, process=tuple(rows))
 
 
 def _check_placeholders(path: Path, index: int, row: Process) -> None:
-    """Refuse what stands in braces and would reach a program as it is."""
+    """Refuse a word in braces that is not a placeholder, because it would reach the program."""
     known = [PYTHON, CONFIG, RUN, *([MODULE] if row.name == MODULE else [])]
     texts = [("name", row.name, [MODULE]), *(("command", word, known) for word in row.command)]
     for key, text, placeholders in texts:
@@ -248,18 +248,18 @@ def _of_module(row: Process, module: str) -> Process:
 
 
 def is_simulated(config: RobotConfig) -> bool:
-    """Return True if any drive of this robot file is an emulated one.
+    """Return True if any drive of this robot file is emulated.
 
-    The CAN buses in use say so, also of drives on USB: all of a real robot's are real ones, or it
-    is started with `simulation=False` (`xrl up --no-sim`). Then a service looks on the real USB.
+    The CAN buses in use decide, also for drives on USB. On a real robot all of them are real, or
+    the fleet starts with `simulation=False` (`xrl up --no-sim`). Then services search the real USB.
     """
     return any(config.can[name].interface == SIMULATED_CAN for name in config.buses)
 
 
 def refuse_half_emulated(robot: RobotConfig) -> None:
-    """Refuse a robot file some of whose buses are emulated and others real.
+    """Refuse a robot file that mixes emulated and real buses.
 
-    One bus that was forgotten would make its USB the emulated one: emulated drives are as wanted.
+    A single forgotten emulated bus would make its USB emulated, and every emulated drive is valid.
     """
     emulated = {name: robot.can[name].interface == SIMULATED_CAN for name in sorted(robot.buses)}
     if len(set(emulated.values())) > 1:
@@ -270,7 +270,7 @@ def refuse_half_emulated(robot: RobotConfig) -> None:
         raise FleetError(
             f"robot file: {some} {'are' if ',' in some else 'is'} emulated "
             f'(interface = "{SIMULATED_CAN}"), {real} not: which drives are meant? Make '
-            "all of them real ones, or all emulated; `xrl up --no-sim` starts no simulator"
+            "all of them real or all emulated; `xrl up --no-sim` starts no simulator"
         )
 
 
@@ -278,13 +278,13 @@ def check_known(names: Iterable[str], known: Collection[str]) -> None:
     """Refuse service names that are not among the known ones."""
     for name in names:
         if name not in known:
-            raise FleetError(f"no service {name!r}; one of {', '.join(known)}")
+            raise FleetError(f"no service {name!r}; must be one of {', '.join(known)}")
 
 
 def _listeners(
     processes: Iterable[Process], config: RobotConfig, run_dir: Path
 ) -> tuple[ListenPoint, ...]:
-    """Return where these services will listen: on the bus, and the emulated drives' buses."""
+    """Return where these services will listen: bus endpoints, and the emulated drives' buses."""
     listeners = []
     here = security.services_here(config)
     for row in processes:
@@ -307,15 +307,15 @@ def _listeners(
 
 
 def _check_lengths(run_dir: Path, listeners: Iterable[ListenPoint]) -> None:
-    """Refuse a run directory that is too long for its UNIX sockets, of whoever listens or dials."""
+    """Refuse a run directory that is too long for the paths of its UNIX sockets."""
     paths = [at.endpoint.removeprefix(UNIX) for at in listeners if at.endpoint.startswith(UNIX)]
-    # supervisord binds NAME.PID first, and renames it
+    # supervisord first binds NAME.PID, then renames it
     paths.append(f"{live_dir(run_dir) / SUPERVISOR_SOCKET}.4194304")
     excess = max(len(os.fsencode(path)) for path in paths) - SOCKET_PATH_MAX
     if excess > 0:
         raise FleetError(
-            f"{run_dir}: run directory too long by {excess} bytes for the paths of its sockets; "
-            "give a shorter one with --run-dir"
+            f"{run_dir}: run directory is {excess} bytes too long for the paths of its sockets; "
+            "choose a shorter one with --run-dir"
         )
 
 
@@ -328,18 +328,18 @@ def check_free(listeners: Iterable[ListenPoint]) -> None:
             fault = _tcp_fault(endpoint)
         if fault:
             raise FleetError(
-                f"{service}: {endpoint}: {fault}; stop what uses it, or change {key} "
+                f"{service}: {endpoint}: {fault}; stop the process that uses it, or change {key} "
                 "in the robot file"
             )
 
 
 def is_elsewhere(endpoint: str) -> bool:
-    """Return True for the endpoint of a service that runs on another host."""
+    """Return True if the endpoint belongs to a service on another host."""
     return not endpoint.startswith(UNIX) and _tcp_fault(endpoint) == _ELSEWHERE
 
 
 def is_listening(endpoint: str) -> bool:
-    """Return True if some process listens on a bus endpoint."""
+    """Return True if a process listens on a bus endpoint."""
     address: str | tuple[str, int]
     if endpoint.startswith(UNIX):
         family, address = socket.AF_UNIX, endpoint.removeprefix(UNIX)
@@ -351,14 +351,14 @@ def is_listening(endpoint: str) -> bool:
         try:
             probe.connect(address)
         except BlockingIOError:
-            return True  # its backlog is full: it listens, and is slow
+            return True  # its backlog is full: it listens, but slowly
         except OSError:
             return False
     return True
 
 
 def _tcp_fault(endpoint: str) -> str:
-    """Return why a service could not listen there, or nothing."""
+    """Return why a service cannot listen there, or an empty string."""
     host, port = host_and_port(endpoint)
     with socket.socket(_family_of(host)) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -369,7 +369,7 @@ def _tcp_fault(endpoint: str) -> str:
                 return "port in use"
             if error.errno == errno.EADDRNOTAVAIL:
                 return _ELSEWHERE
-            return f"cannot be listened on: {error.strerror or error}"
+            return f"cannot listen: {error.strerror or error}"
     return ""
 
 

@@ -1,7 +1,7 @@
-"""A fleet's processes by Linux's /proc: found, looked at, signalled; and tied to a parent's life.
+"""A fleet's processes in Linux's /proc: find, inspect and signal them; tie one to its parent.
 
 Every process of a fleet has the run directory in `FLEET_VARIABLE` of its environment, so
-it can be found without its supervisor, and a reused process id is never mistaken.
+it is found without its supervisor, and a reused process id is never mistaken for it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _POLL_S = 0.05
 _PR_SET_PDEATHSIG = 1
 _prctl = ctypes.CDLL(None, use_errno=True).prctl
 _SERVICE_VARIABLE = b"SUPERVISOR_PROCESS_NAME="
-"""Set by supervisord: the service's name."""
+"""Service name, set by supervisord."""
 
 
 def fleet_pids(run_dir: Path) -> set[int]:
-    """Return the processes of the fleet in this run directory, supervisor included."""
+    """Return the processes of the fleet in this run directory, including the supervisor."""
     pids = (int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
     return {pid for pid in pids if pid != os.getpid() and belongs(pid, run_dir)}
 
@@ -42,7 +42,7 @@ def service_pids(run_dir: Path) -> dict[str, int]:
 
 
 def belongs(pid: int, run_dir: Path) -> bool:
-    """Return True if a process is this user's and of the fleet in this run directory."""
+    """Return True if a process is of this user and of the fleet in this run directory."""
     try:
         own = Path(f"/proc/{pid}").stat().st_uid == os.getuid()
     except OSError:
@@ -51,7 +51,7 @@ def belongs(pid: int, run_dir: Path) -> bool:
 
 
 def _environment(pid: int) -> list[bytes]:
-    """Return a process's variables; none if it has ended or is somebody else's."""
+    """Return a process's variables; empty if it has ended or has another owner."""
     try:
         return Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
     except OSError:
@@ -59,7 +59,7 @@ def _environment(pid: int) -> list[bytes]:
 
 
 def fleets() -> set[str]:
-    """Return the run directories of all fleets that have a process now."""
+    """Return the run directories of all fleets that have a process."""
     mark = os.fsencode(f"{FLEET_VARIABLE}=")
     found = set()
     for entry in Path("/proc").iterdir():
@@ -69,7 +69,7 @@ def fleets() -> set[str]:
 
 
 def connected(pid: int) -> set[tuple[str, int]]:
-    """Return the other ends of a process's TCP connections: numeric address and port."""
+    """Return the remote ends of a process's TCP connections: numeric address and port."""
     inodes = set()
     with contextlib.suppress(OSError):  # it has just ended
         for entry in Path(f"/proc/{pid}/fd").iterdir():
@@ -81,13 +81,13 @@ def connected(pid: int) -> set[tuple[str, int]]:
 
 
 def cpu_s_of(pids: Iterable[int]) -> dict[int, float]:
-    """Return the processor time that processes have used; one that has ended is left out."""
+    """Return the CPU time that processes have used, without those that have ended."""
     fields = {pid: _stat(pid) for pid in pids}
     return {pid: (int(f[11]) + int(f[12])) / _TICKS_PER_S for pid, f in fields.items() if f}
 
 
 def uptime_s(pid: int) -> float:
-    """Return how long ago a process was started; 0 if it is gone."""
+    """Return the time since a process started; 0 if it has ended."""
     fields = _stat(pid)
     if not fields:
         return 0.0
@@ -106,16 +106,16 @@ def is_gone(pid: int) -> bool:
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the kernel's fields of a process, its state first (proc(5)); none if it is gone."""
+    """Return the kernel's fields of a process, its state first (proc(5)); empty if it ended."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return []
-    return text.rpartition(")")[2].split()  # the name before may hold anything
+    return text.rpartition(")")[2].split()  # the name in parentheses may contain anything
 
 
 def signal_all(pids: Iterable[int], number: int) -> None:
-    """Send a signal to each process that still is there."""
+    """Send a signal to each process that still exists."""
     for pid in pids:
         try:
             os.kill(pid, number)
@@ -124,12 +124,12 @@ def signal_all(pids: Iterable[int], number: int) -> None:
 
 
 def wait_until_gone(run_dir: Path, timeout_s: float) -> set[int]:
-    """Wait until no process of the fleet is left; return those that are after the timeout."""
+    """Wait until no process of the fleet is left; return those left after the timeout."""
     deadline = time.monotonic() + timeout_s
     left: set[int] = set()
     while True:
-        # An ending process loses its environment before its sockets, so those seen once
-        # are followed by their id.
+        # An ending process loses its environment before its sockets, so once found it is
+        # followed by its id.
         left = {pid for pid in left | fleet_pids(run_dir) if not is_gone(pid)}
         if not left or time.monotonic() > deadline:
             return left
@@ -137,9 +137,9 @@ def wait_until_gone(run_dir: Path, timeout_s: float) -> set[int]:
 
 
 def die_with_parent(parent_pid: int, number: signal.Signals) -> None:
-    """Have the kernel send this process a signal when its parent dies.
+    """Let the kernel send this process a signal when its parent dies.
 
-    Also when the parent is dead already: it may have died before this call.
+    Send it at once if the parent died before this call.
     """
     if _prctl(_PR_SET_PDEATHSIG, int(number), 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")

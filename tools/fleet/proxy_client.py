@@ -1,4 +1,4 @@
-"""Speaks to the network proxy of a fleet that is up."""
+"""Client of the network proxy of a running fleet."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _decode = msgspec.json.Decoder(Reply).decode
 
 
 class ProxyClient:
-    """One question, one answer, one connection each."""
+    """One connection per request and reply."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir, self._path = run_dir, live_dir(run_dir) / SOCKET
 
     def begin(self, inject: Inject, in_s: float = 0.0) -> tuple[RequestedImpairment, ...]:
-        """Start an impairment after a delay, s; return all impairments then."""
+        """Start an impairment after a delay, s; return all impairments."""
         return self._ask(Begin(inject, in_s))
 
     def clear(self, link: str) -> tuple[RequestedImpairment, ...]:
@@ -61,31 +61,31 @@ class ProxyClient:
             raise FleetError(text) from None
         if not line:
             raise FleetError(
-                f"{self._path}: the network proxy ended without an answer; see its log"
+                f"{self._path}: the network proxy ended without answering; see its log"
             )
         try:
             reply = _decode(line)
         except (msgspec.DecodeError, UnicodeDecodeError) as error:
-            text = f"{self._path}: the answer is not from a network proxy of this version: {error}"
+            text = f"{self._path}: this answer is not from a network proxy of this version: {error}"
             raise FleetError(text) from None
         if reply.error:
             raise FleetError(f"refused: {reply.error}")
         return reply.requested
 
     def _why_absent(self) -> str:
-        """Return why nobody listens there, and the way out."""
+        """Return why the proxy does not listen, and the remedy."""
         folder = RunDir(self._run_dir)
         manifest = folder.read_manifest()
         if manifest is None or not folder.supervisor_socket.exists():
             return (
-                f"no fleet is up in {folder.path}; `xrl up --injectable` starts one to inject into"
+                f"no fleet is up in {folder.path}; `xrl up --injectable` starts one for injection"
             )
         if "network_proxy" not in manifest.services:
             return (
-                f"the fleet in {folder.path} was started without a network proxy; `xrl down`, then "
+                f"the fleet in {folder.path} has no network proxy; run `xrl down`, then "
                 "`xrl up --injectable`"
             )
         return (
             f"the network proxy in {folder.path} is down or restarting, and every impairment "
-            "is over; `xrl status`, `xrl start network_proxy`"
+            "has ended; run `xrl status`, then `xrl start network_proxy`"
         )

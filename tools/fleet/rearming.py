@@ -1,8 +1,8 @@
-"""The end of an emergency stop: all six modules are armed again together, or none of them.
+"""End of an emergency stop: all six modules are armed again together, or none of them.
 
-A module that is re-armed alone holds while the other five sink. So the services of all stopped
-modules are restarted at the same moment. Each drive holds by its own loop until its new service
-takes it over, which needs a planner.
+A module that is re-armed alone holds while the other five sink, so the services of all stopped
+modules restart at the same moment. Each drive holds with its own loop until its new service takes
+it over, which needs a planner.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from shared.joints import MODULES
 from tools.fleet.supervise import SupervisedFleet
 
 PULL_MAX_N: Final = 40.0
-"""Largest force on the harness, N, as of a hand that leads. A simulated hand that still pulled by
-150 N raised the robot by 0.37 m within 0.7 s of the re-arming."""
+"""Maximum force on the harness, N, about that of a leading hand. A simulated hand that still pulled
+with 150 N raised the robot by 0.37 m within 0.7 s of the re-arming."""
 HEARD_S: Final = 3.0
 """Timeout for the first message of each module and of a planner, s."""
 REST_S: Final = 1.0
 REST_RAD: Final = 0.01
-"""A module that moves less than this in that time is at rest; rates are too noisy to tell."""
+"""A module that moves less than this within `REST_S` is at rest; rates are too noisy for this."""
 READY_S: Final = 30.0
 """Timeout for all six modules to hold or track again, s."""
 _UNHEARD_S: Final = 0.5
-"""A module or planner whose newest message is older is not heard."""
+"""A module or planner is silent if its newest message is older than this, s."""
 _POLL_S: Final = 0.01
 _HOLDS: Final = (DriveStatus.ARMED, DriveStatus.HOLDING)
 _PLANNER: Final = "planner"
 _LIMP: Final = (
-    "hang the robot, remove the cause that `xrl status` names, then `xrl down` and `xrl up`"
+    "hang the robot, remove the cause that `xrl status` names, then run `xrl down` and `xrl up`"
 )
 
 
@@ -43,7 +43,7 @@ def rearm(fleet: SupervisedFleet) -> float:
     """End the emergency stop; return the time until all six modules hold or track, s.
 
     Raises:
-        FleetError: it is not safe, and nothing was changed; or not all six hold in time.
+        FleetError: it is not safe, and nothing was changed; or a module does not hold in time.
     """
     with open_session(fleet.manifest.robot(), "rearm", fleet.run.path) as session:
         ear = _Ear(session)
@@ -67,47 +67,47 @@ def hindrance(
     """Return why the emergency stop cannot be ended now; empty if it can.
 
     Args:
-        states: newest state of each module that is heard.
+        states: newest state of each module that sends.
         moved: modules that have just moved.
         here: services that have a process on this host.
-        pull_n: force on the harness, N; 0 if it is unknown.
-        planner: True if a planner is heard.
+        pull_n: force on the harness, N; 0 if unknown.
+        planner: True if a planner sends.
     """
     if silent := [module for module in MODULES if module not in states]:
-        return f"no state from {', '.join(silent)}; see `xrl status`"
+        return f"no state from {', '.join(silent)}; run `xrl status`"
     stopped = [module for module in MODULES if states[module].mode == Mode.DAMP]
     if not stopped:
-        return "no module is in DAMP, so no emergency stop holds"
+        return "no module is in DAMP, so no emergency stop is active"
     for module, state in states.items():
         if state.mode == Mode.FAULT or state.drive not in _HOLDS:
             mode, drive = name_of(Mode, state.mode), name_of(DriveStatus, state.drive)
-            return f"{module} is in {mode}, its drive {drive}; {_LIMP}"
+            return f"{module} is in {mode}, its drive is {drive}; {_LIMP}"
     if elsewhere := [module for module in stopped if module not in here]:
-        return f"no service of {', '.join(elsewhere)} on this host; `xrl hosts down`, then `up`"
+        return f"no service of {', '.join(elsewhere)} on this host; run `xrl hosts down`, then `up`"
     if moved:
-        return f"{', '.join(moved)} still moving; wait until the robot is at rest"
+        return f"{', '.join(moved)} still moving; wait until the robot has stopped moving"
     if pull_n > PULL_MAX_N:
         return (
-            f"{pull_n:.0f} N on the harness would move the robot at once; take hands and load off "
-            f"it, below {PULL_MAX_N:g} N (a simulated hand goes where `xrl lead` leads it)"
+            f"{pull_n:.0f} N on the harness would move the robot at once; reduce it below "
+            f"{PULL_MAX_N:g} N (take hands and load off; move a simulated hand with `xrl lead`)"
         )
-    return "" if planner else "no planner is heard, and only with one are drives taken over"
+    return "" if planner else "no planner is running, and only a planner lets drives be taken over"
 
 
 class _Ear:
-    """Newest state of each module, and whether a planner is heard."""
+    """Newest state of each module, and whether a planner sends its status."""
 
     def __init__(self, session: Session) -> None:
         self._latest = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._wrenches = session.latest(topics.WRENCH, Wrench)
         self.pull_n = 0.0
-        """Newest force on the harness, N; 0 if it is unknown."""
+        """Newest force on the harness, N; 0 if unknown."""
         self._newest: dict[str, JointState] = {}
         self._heard_s: dict[str, float] = {}
 
     def listen(self) -> None:
-        """Receive new messages, after a moment."""
+        """Receive new messages, after a short sleep."""
         time.sleep(_POLL_S)
         now_s = time.monotonic()
         for module, latest in self._latest.items():
@@ -123,16 +123,16 @@ class _Ear:
 
     @property
     def hears_planner(self) -> bool:
-        """True if a planner is heard."""
+        """True if a planner sends its status."""
         return self._hears(_PLANNER)
 
     @property
     def states(self) -> dict[str, JointState]:
-        """Newest state of each module that is heard."""
+        """Newest state of each module that is not silent."""
         return {module: state for module, state in self._newest.items() if self._hears(module)}
 
     def listen_for_all(self) -> None:
-        """Wait for the first message of each, but not for long."""
+        """Wait for the first message of each, at most `HEARD_S`."""
         deadline_s = time.monotonic() + HEARD_S
         while time.monotonic() < deadline_s and not (
             self.hears_planner and len(self.states) == len(MODULES)
@@ -140,7 +140,7 @@ class _Ear:
             self.listen()
 
     def moved(self) -> list[str]:
-        """Listen for `REST_S`; return the modules that moved by more than `REST_RAD`."""
+        """Receive for `REST_S`; return the modules that moved by more than `REST_RAD`."""
         before = self.states
         ends_s = time.monotonic() + REST_S
         while time.monotonic() < ends_s:
@@ -153,10 +153,10 @@ class _Ear:
         ]
 
     def wait_until_armed(self) -> float:
-        """Wait until all six hold or track, by their states from now on; return the time, s.
+        """Wait until all six hold or track, by their new states; return the time, s.
 
         Raises:
-            FleetError: one does not in time.
+            FleetError: a module does not in time.
         """
         begin_s = time.monotonic()
         self._newest.clear()
@@ -174,6 +174,6 @@ class _Ear:
                     if m not in armed
                 ]
                 raise FleetError(
-                    f"not armed after {READY_S:g} s: {', '.join(left)}; their drives hold as they "
-                    "did; `xrl status` names the way out"
+                    f"not armed after {READY_S:g} s: {', '.join(left)}; their drives still hold as "
+                    "before; `xrl status` names the remedy"
                 )

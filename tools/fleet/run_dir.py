@@ -31,27 +31,27 @@ from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_lis
 SUPERVISOR_PID: Final = "supervisord.pid"
 """Written when the fleet starts."""
 MARKER: Final = ".xrl-run"
-"""Lies in every run directory: nothing is removed, and nobody attached to, where it does not."""
+"""Present in every run directory; without it nothing is removed, and nothing attaches."""
 
 ENDING_S: Final = 0.5
-"""Longest wait for the lock of a fleet whose processes were killed, and are no longer found."""
+"""Timeout for the lock of a fleet whose processes were killed and are no longer found, s."""
 
 _BY_HAND: Final = (
     "*.zenoh.lock", "*.rearm", "*.near", "*.heat", "*.zero", PACE_FILE, usb_standin.FOLDER,
     usb_standin.BUILT,
 )  # fmt: skip
-"""Names that services started by hand leave in a run directory, beside sockets."""
+"""Names, besides sockets, that services started by hand leave in a run directory."""
 _LOGGED: Final = (*SERVICES, "network_proxy", "ros2_gateway", "supervisord", "view")
-"""What has a log in a run directory."""
+"""Processes that have a log in a run directory."""
 
 FILES_MIN: Final = 128
-"""Files that the supervisor may have open at the least: three for each of some twelve services."""
+"""Minimum limit of open files for the supervisor: three for each of about twelve services."""
 SPACE_MIN_MIB: Final = 4
 """Free space that a start needs in the run directory, for logs."""
 SPACE_LOW_MIB: Final = 64
-"""Free space below which `xrl status` says so: each of twelve logs may take 10 MB."""
+"""Free space below which `xrl status` warns: each of twelve logs may take 10 MB."""
 _NEVER_GIVE_UP = 1_000_000
-"""Starts that may fail in a row (`supervisor_process.BACKOFF_MAX_S`)."""
+"""Maximum failed starts in a row (`supervisor_process.BACKOFF_MAX_S`)."""
 
 
 class Manifest(msgspec.Struct, frozen=True):
@@ -61,22 +61,22 @@ class Manifest(msgspec.Struct, frozen=True):
     """The robot file, absolute."""
     services: tuple[str, ...]
     topics: dict[str, str]
-    """Topic that each service publishes steadily; empty if there is none."""
+    """Topic that each service publishes steadily, or an empty string."""
     sockets: tuple[str, ...]
     """Every socket that the services may leave behind."""
     stop_s: float
-    """Longest time a service may take to stop."""
+    """Longest time that a service may take to stop, s."""
 
     def robot(self) -> RobotConfig:
-        """Return the robot of its file."""
+        """Return the robot from its file."""
         return load(Path(self.config))
 
 
 class RunDir:
-    """Paths in a run directory; nothing is made before `claim`."""
+    """Paths in a run directory; nothing is created before `claim`."""
 
     def __init__(self, path: Path) -> None:
-        self.path = Path(os.path.abspath(path))  # noqa: PTH100 - no symlink resolved: paths stay short
+        self.path = Path(os.path.abspath(path))  # noqa: PTH100 - keeps symlinks: paths stay short
         self.marker = self.path / MARKER
         self.live = live_dir(self.path)
         self.pace = self.live / PACE_FILE
@@ -89,20 +89,20 @@ class RunDir:
         self.supervisor_stderr = self.logs / "supervisord.stderr"
 
     def log_of(self, service: str) -> Path:
-        """Return where a service's output goes."""
+        """Return the path of a service's log."""
         return self.logs / f"{service}.log"
 
     @property
     def is_marked(self) -> bool:
-        """True for a directory that is this user's, and a fleet's."""
+        """True for a directory of this user that belongs to a fleet."""
         check_own(self.path, alone=False)
         return self.marker.exists()
 
     def claim(self, *, alone: bool = True) -> int:
-        """Make the directory, or take one that is empty or a fleet's; mark and lock it.
+        """Create the directory, or use an empty or a fleet's directory; mark and lock it.
 
-        The supervisor inherits the descriptor, so the lock lives as long as it does. A process that
-        was killed holds it for a moment after it has ended to all appearances: `ENDING_S`.
+        The supervisor inherits the descriptor, so the lock lives as long as the supervisor. A
+        killed process may still hold it for a moment after it has disappeared: `ENDING_S`.
         """
         give_up_s = time.monotonic() + ENDING_S
         while True:
@@ -116,11 +116,11 @@ class RunDir:
                     continue
                 raise FleetError(
                     f"a fleet is up in {self.path}; stop it with `xrl down`, "
-                    "or give another directory with --run-dir"
+                    "or choose another directory with --run-dir"
                 ) from None
             if self._is_current(descriptor):
                 return self._marked(descriptor)
-            os.close(descriptor)  # removed by a `down` before we had the lock: again
+            os.close(descriptor)  # a `down` removed it before this process had the lock: retry
 
     def _open(self, *, alone: bool) -> int:
         check_own(self.path, alone=alone)
@@ -143,7 +143,7 @@ class RunDir:
             raise self._unusable(error) from None
         os.close(descriptor)
         raise FleetError(
-            f"{self.path}: holds {foreign}, which does not belong to a fleet; give a new or an "
+            f"{self.path}: contains {foreign}, which does not belong to a fleet; choose a new or "
             "empty directory with --run-dir"
         )
 
@@ -151,9 +151,9 @@ class RunDir:
         return FleetError(f"{self.path}: cannot be a run directory: {os_error_in_words(error)}")
 
     def _foreign(self) -> str | None:
-        """Return the name of a file that no fleet has left here, or None."""
+        """Return the name of a file here that is not a fleet's, or None."""
         if self.supervisor_log.exists():
-            return None  # a fleet of a version that left no mark
+            return None  # a fleet of a version without a mark
         for entry in sorted(self.path.iterdir()):
             by_hand = any(entry.match(pattern) for pattern in _BY_HAND)
             if not by_hand and not stat.S_ISSOCK(entry.lstat().st_mode):
@@ -167,9 +167,9 @@ class RunDir:
             return False
 
     def prepare(self, plan: FleetPlan, pace: float = 1.0) -> None:
-        """Start with empty logs and no dead sockets; write what supervisor and services read.
+        """Remove old logs and dead sockets; write the files of the supervisor and the services.
 
-        A disk that is nearly full is no reason for a disarmed start to fail: nobody looks on.
+        A nearly full disk does not stop a disarmed start, because no person is there to react.
         """
         try:
             self._prepare(plan, pace)
@@ -177,12 +177,12 @@ class RunDir:
         except OSError as error:
             raise FleetError(
                 f"{os_error_in_words(error)}; a fleet keeps its logs in {self.path}, its sockets "
-                f"and shared memory in {self.live}: give another directory with --run-dir"
+                f"and shared memory in {self.live}: choose another directory with --run-dir"
             ) from None
         if free_mib < SPACE_MIN_MIB and not plan.options.disarmed:
             raise FleetError(
-                f"{self.path}: {free_mib:.1f} MiB free, and a fleet needs {SPACE_MIN_MIB} MiB "
-                "there for its logs; free some, or give another --run-dir"
+                f"{self.path}: {free_mib:.1f} MiB free, but a fleet needs {SPACE_MIN_MIB} MiB "
+                "there for its logs; free some space, or choose another --run-dir"
             )
 
     def _prepare(self, plan: FleetPlan, pace: float) -> None:
@@ -195,7 +195,7 @@ class RunDir:
         if not disarmed:
             self._remove_logs()
             kept_state.forget_stops(self.path)
-            # after a crash of the supervisor somebody may rest on the harness
+            # after a crash of the supervisor a person may be resting on the harness
             zero_path(self.path).unlink(missing_ok=True)
         kept_state.restore(self.path)
         self.logs.mkdir(exist_ok=True)
@@ -218,7 +218,7 @@ class RunDir:
                     guard.write(LastState.HELD)
 
     def _remove_shared_memory(self, *, keep_stops: bool) -> None:
-        """Remove what an earlier fleet shared; its rearm guards only where a person asks."""
+        """Remove the shared memory of an earlier fleet, but rearm guards only if a person asks."""
         neighbours.path_of(self.path).unlink(missing_ok=True)
         for module in () if keep_stops else MODULES:
             rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
@@ -233,7 +233,7 @@ class RunDir:
     def clear(self, *, keep_logs: bool, keep_stops: bool = False) -> None:
         """Remove the fleet's files, and its two directories if they are then empty.
 
-        In a directory that is no fleet's nothing is removed. What a read-only disk keeps is logged.
+        Nothing is removed in a directory without a fleet's mark. Failed removals are logged.
         """
         if not self.is_marked:
             return
@@ -249,7 +249,7 @@ class RunDir:
                 self.marker.unlink()
                 self.path.rmdir()
         except OSError as error:
-            log.get("xrl").warning("not all files are removed: %s", os_error_in_words(error))
+            log.get("xrl").warning("some files could not be removed: %s", os_error_in_words(error))
 
     def _clear_live(self, *, keep_stops: bool, keep_heat: bool) -> None:
         manifest = self.read_manifest()
@@ -263,11 +263,11 @@ class RunDir:
         if self.live != self.path:
             for heat in () if keep_heat else self.live.glob(kept_state.HEAT):
                 heat.unlink()
-            with contextlib.suppress(OSError):  # none there, or it keeps a stop or others' files
+            with contextlib.suppress(OSError):  # missing, or it keeps a stop or other files
                 self.live.rmdir()
 
     def _remove_logs(self) -> None:
-        with contextlib.suppress(OSError):  # none there, or it holds files of others
+        with contextlib.suppress(OSError):  # missing, or it contains other files
             for name in _LOGGED:
                 for ending in (".log", ".log.1", ".stderr"):
                     (self.logs / f"{name}{ending}").unlink(missing_ok=True)
@@ -275,7 +275,7 @@ class RunDir:
 
 
 def free_mib_at(path: Path) -> float:
-    """Return the free space where a directory is, MiB."""
+    """Return the free space on the disk of a directory, MiB."""
     return shutil.disk_usage(path).free / (1 << 20)
 
 
@@ -293,7 +293,7 @@ def supervisor_config(run: RunDir, plan: FleetPlan) -> str:
             "minfds": FILES_MIN,
         },
         "rpcinterface:supervisor": {factory: "supervisor.rpcinterface:make_main_rpcinterface"},
-        # of tools.fleet.supervisor_process, which is the main module there
+        # from tools.fleet.supervisor_process, which is the main module there
         "rpcinterface:xrl": {factory: "__main__:make_interface"},
     }
     for priority, row in enumerate(plan.processes):
@@ -323,19 +323,19 @@ def supervisor_config(run: RunDir, plan: FleetPlan) -> str:
 
 
 def one_line(value: object) -> str:
-    """Return a value as supervisord's file holds it.
+    """Return a value as it is written to supervisord's file.
 
-    `tools.fleet.supervisor_process` reads a value without comments behind it and fills nothing in,
+    `tools.fleet.supervisor_process` reads values without trailing comments and expands nothing,
     so only a line break is special.
     """
     text = str(value)
     if "\n" in text or "\r" in text:
-        raise FleetError(f"{text!r}: a path or argument of a service has no line break; rename it")
+        raise FleetError(f"{text!r}: a path or argument of a service has a line break; rename it")
     return text
 
 
 def _remove_socket(path: Path) -> None:
-    """Remove a socket that nobody listens on, and the lock that Zenoh lays beside it."""
+    """Remove a socket without a listener, and the lock that Zenoh creates beside it."""
     if path.exists() and stat.S_ISSOCK(path.lstat().st_mode) and not is_listening(f"{UNIX}{path}"):
         path.unlink(missing_ok=True)
     lock = Path(f"{path}.lock")

@@ -1,7 +1,7 @@
-"""Stalls: times in which the machine ran nothing, and what is judged apart because of them.
+"""Stalls: times in which the machine ran nothing. The judgement excludes their consequences.
 
-A module that gets no command in time holds, as it should. One timer thread measures stalls beside a
-live run; status line, picture and verdict mark them, the latter two by events in the record.
+A module that gets no command in time holds, as it should. One timer thread measures stalls during
+a live run. The status line, picture and verdict show them, the latter two from the record's events.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from shared.clock import NS_PER_MS, NS_PER_S, pace
 MACHINE: Final = "the machine"
 PERIOD_NS: Final = 4 * NS_PER_MS
 GAP_NS: Final = 20 * NS_PER_MS
-"""A delay beyond the period that counts: with some milliseconds of network, an age of 50 ms."""
+"""Minimum delay beyond the period that counts; with network delay, an age can reach 50 ms."""
 PRIORITY: Final = 30
-"""Above every service (`shared.scheduling`), and within the limit that docs/bring-up.md sets."""
+"""Above every service (`shared.scheduling`), and within the limit in docs/bring-up.md."""
 LASTED_MAX_MS: Final = 1e9
 DROP_OUT_NS: Final = 150 * NS_PER_MS
-"""Time after a stall within which a module loses TRACK because of it: commands are too old."""
+"""Time after a stall within which a module loses TRACK because its commands are too old."""
 EXCUSE_MIN_MS: Final = 30.0
-"""A shorter stall makes no command 50 ms old: most are some 10 ms old when they are used."""
+"""A shorter stall makes no command 50 ms old: most commands are about 10 ms old when used."""
 APART_NS: Final = 3 * NS_PER_S
 """Time after a stall in which modules track again and the robot catches up with the hand."""
 STALL_SHOWN_NS: Final = 2 * NS_PER_S
-"""Time for which a display names a stall."""
+"""Time for which a display shows a stall."""
 
 
 class Stall(NamedTuple):
-    """Time in which the machine ran nothing, monotonic as of messages."""
+    """Time in which the machine ran nothing, on the monotonic clock of messages."""
 
     begin_ns: int
     end_ns: int
 
     @property
     def lasted_ms(self) -> float:
-        """How long it was."""
+        """Its length, ms."""
         return (self.end_ns - self.begin_ns) / NS_PER_MS
 
     @property
     def words(self) -> str:
-        """For a display."""
+        """Text for a display."""
         return f"{MACHINE} stalled for {self.lasted_ms:.0f} ms"
 
     def event(self, seq: int, scenario_zero_ns: int) -> RunEvent:
@@ -63,10 +63,10 @@ class Stall(NamedTuple):
 
 
 def stalls_of(events: Iterable[RunEvent]) -> list[Stall]:
-    """Return the stalls among a run's events; those of another form are left out."""
+    """Return the stalls among a run's events, without those in another form."""
     found = []
     for event in events:
-        with suppress(ValueError):  # written by hand
+        with suppress(ValueError):  # the event was written by hand
             if event.kind == RunEventKind.STALLED:
                 lasted_ms = float(event.detail.removesuffix(" ms"))
                 if 0.0 < lasted_ms < LASTED_MAX_MS:
@@ -75,7 +75,7 @@ def stalls_of(events: Iterable[RunEvent]) -> list[Stall]:
 
 
 class Disturbance(NamedTuple):
-    """A stall, until when the run is judged apart, and how many modules went to HOLD by it."""
+    """A stall, the end of the time that is judged separately, and the modules that it held."""
 
     stall: Stall
     end_ns: int
@@ -85,9 +85,9 @@ class Disturbance(NamedTuple):
 def disturbances(
     events: Sequence[RunEvent], changes: Sequence[JointEvent], end_ns: int
 ) -> list[Disturbance]:
-    """Return what each stall made of a run up to a time; `changes` are those of all modules.
+    """Return the effect of each stall until a time; `changes` are those of all modules.
 
-    After a kill or a fault no HOLD is a stall's doing: it may be that one's.
+    A HOLD after a kill or a fault is not attributed to a stall: the kill may have caused it.
     """
     own, by_it = (RunEventKind.KILLED, RunEventKind.FAULTED), (Cause.COMMAND_STALE, Cause.HOLD_ALL)
     limit_ns = min([row.t_ns for row in events if row.kind in own] + [end_ns])
@@ -105,12 +105,12 @@ def disturbances(
 
 
 def goes_to_hold(row: JointEvent) -> bool:
-    """Return True for a module that drops out: it tracked, and holds."""
+    """Return True for a dropout: the module tracked, and now holds."""
     return row.mode_before == Mode.TRACK and row.mode_after == Mode.HOLD
 
 
 def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return for each time whether it is judged apart."""
+    """Return for each time whether it is judged separately."""
     mask = np.zeros(len(times_ns), dtype=bool)
     for row in rows:
         mask |= (times_ns >= row.stall.begin_ns) & (times_ns <= row.end_ns)
@@ -118,19 +118,19 @@ def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[
 
 
 class StallWatch:
-    """A timer thread beside a fleet, in real time where that is allowed."""
+    """A timer thread beside a fleet, with real-time priority where that is allowed."""
 
     def __init__(self) -> None:
         self.longest = Stall(0, 0)
-        """The longest of the last moments; (0, 0) before the first."""
+        """Longest recent stall; (0, 0) before the first."""
         self.held = 0
-        """The most modules in HOLD at once since then."""
+        """Largest number of modules in HOLD at once since then."""
         self._gaps: deque[tuple[int, int]] = deque()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="stalls", daemon=True)
 
     def __enter__(self) -> Self:
-        """Start."""
+        """Start the thread."""
         self._thread.start()
         return self
 
@@ -150,15 +150,15 @@ class StallWatch:
         return found
 
     def is_recent(self, now_ns: int) -> bool:
-        """Return True if the longest stall is still to be shown."""
+        """Return True if the longest stall must still be shown."""
         return self.longest.end_ns > 0 and now_ns - self.longest.end_ns <= STALL_SHOWN_NS
 
     def note_held(self, count: int) -> None:
-        """Count the modules that are in HOLD now."""
+        """Record how many modules are in HOLD now."""
         self.held = max(self.held, count)
 
     def _watch(self) -> None:
-        with suppress(PermissionError):  # of this thread alone
+        with suppress(PermissionError):  # priority of this thread only
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         last_ns = time.monotonic_ns()
         while not self._over.is_set():

@@ -1,4 +1,4 @@
-"""A fleet's status and neighbours as text and tables."""
+"""A fleet's status and other fleets on this machine, as text and tables."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _GOOD_STATES: Final = ("running", "starting")
 
 
 def _describe_lead(lead: LeadStatus | None) -> str:
-    """Return one line on the planner."""
+    """Return one line about the planner."""
     if lead is None:
-        return "planner silent: each module holds by itself"
+        return "planner silent: each module holds on its own"
     words = f"planner {lead.mode}, margin {lead.margin:.2f}, carries {lead.carried_n:.0f} N"
     if lead.wearer:
         words += f"; {lead.wearer}"
     if lead.wait_s > 0.0:
-        words += f"; leads again in {lead.wait_s:.0f} s at the earliest, after drop-outs or trips"
+        words += f"; leads again in {lead.wait_s:.0f} s at the earliest, after dropouts or trips"
     if lead.why:
         words += f"; {printable(lead.why)}"
     return words
@@ -42,13 +42,13 @@ REMEDIES: Final = {
     Refusal.TOO_OLD.name: "a slow link or a slow planner",
     Refusal.FOREIGN_SESSION.name: "a second planner, or one that the module has left: end one",
     Refusal.NOT_NEWER.name: "a network that repeats, or a command forged in the planner's name",
-    Refusal.OUT_OF_ENVELOPE.name: "a wrong planner, or a forged command: xrl kill planner",
-    Refusal.OUT_OF_LIMITS.name: "a wrong planner, or a forged command: xrl kill planner",
+    Refusal.OUT_OF_ENVELOPE.name: "a faulty planner, or a forged command: run xrl kill planner",
+    Refusal.OUT_OF_LIMITS.name: "a faulty planner, or a forged command: run xrl kill planner",
     Refusal.TOO_FAR_AHEAD.name: "a number that no planner reaches: find out who sends it",
-    Refusal.FROM_THE_FUTURE.name: "clocks of several hosts mixed up, or a forged command",
-    Refusal.MALFORMED.name: "no planner sends null, NaN or broken JSON: find out who does",
+    Refusal.FROM_THE_FUTURE.name: "mixed clocks of several hosts, or a forged command",
+    Refusal.MALFORMED.name: "no planner sends null, NaN or broken JSON: find the sender",
 }
-"""By the cause of a refusal: what it is likely to be, or what to do."""
+"""Likely cause or remedy, by the cause of a refusal."""
 
 
 def _describe_refusals(status: FleetStatus) -> list[str]:
@@ -66,7 +66,7 @@ def _describe_refusals(status: FleetStatus) -> list[str]:
 
 
 def _describe_ways_out(status: FleetStatus) -> list[str]:
-    """Return a line for each way out of a state that a person must end, with its modules."""
+    """Return a line with the modules for each remedy that a person must apply."""
     found = _gathered((module.way_out, name) for name, module in status.modules.items())
     return [
         f"{', '.join(names)}: {words.replace('MODULE', names[0]) if len(names) == 1 else words}"
@@ -76,7 +76,7 @@ def _describe_ways_out(status: FleetStatus) -> list[str]:
 
 
 def _describe_stop(status: FleetStatus) -> list[str]:
-    """Return a line for each source of an emergency stop that holds."""
+    """Return a line for each source of an active emergency stop."""
     found = _gathered((module.stopped_by, name) for name, module in status.modules.items())
     return [
         f"emergency stop by {printable(source)}: {', '.join(names)}"
@@ -86,7 +86,7 @@ def _describe_stop(status: FleetStatus) -> list[str]:
 
 
 def _describe_sessions(status: FleetStatus) -> str:
-    """Return what to say if the modules do not all follow the planner that is heard; else ""."""
+    """Return a warning if some modules do not follow the planner that is leading, else ""."""
     lead = status.lead.session if status.lead is not None else 0
     others = _gathered(
         (module.session, name)
@@ -94,7 +94,7 @@ def _describe_sessions(status: FleetStatus) -> str:
         if module.session and lead and module.session != lead and module.mode is not None
     )
     return "; ".join(
-        f"{', '.join(names)}: last followed session {session}, and the planner heard is {lead}"
+        f"{', '.join(names)}: last followed session {session}, but the planner's session is {lead}"
         for session, names in others.items()
     )
 
@@ -107,14 +107,14 @@ def _gathered(pairs: Iterable[tuple[K, str]]) -> dict[K, list[str]]:
 
 
 def _describe_real_time(status: FleetStatus) -> str:
-    """Return which services were refused a real-time priority; "" if none."""
+    """Return the services without the real-time priority that they need; "" if there are none."""
     without = [name for name, row in status.services.items() if row.real_time is False]
-    words = "without real-time priority, commands may come late (`xrl doctor` has the remedy)"
+    words = "without real-time priority, commands may be late (`xrl doctor` shows the remedy)"
     return f"{words}: {', '.join(without)}" if without else ""
 
 
 def _describe_tools(status: FleetStatus) -> str:
-    """Return the tools that are linked, for example "view on lab3, lead on pad"."""
+    """Return the linked tools, for example "view on lab3, lead on pad"."""
     words = []
     for name in status.tools:
         tool, _, place = name.partition(".")
@@ -124,7 +124,7 @@ def _describe_tools(status: FleetStatus) -> str:
 
 
 def tables(status: FleetStatus) -> Group:
-    """Return the status as two tables for the terminal, and what there is to say beside."""
+    """Return the status as two tables for the terminal, with lines of text below them."""
     services = Table(
         title=f"services in {status.run_dir}", title_justify="left", box=box.SIMPLE_HEAD
     )
@@ -165,7 +165,7 @@ def _lines(status: FleetStatus) -> Iterator[str | Text]:
     red, yellow = " [bold red]{}[/]", " [bold yellow]{}[/]"
     way_out = "kill network_proxy" if SILENT_PROXY in status.network else "inject --clear all"
     impaired = f" [bold yellow]impaired on purpose: {{}}[/] (xrl {way_out})"
-    slow = f"in slow motion: the fleet's clock goes at {status.pace:g} of real time"
+    slow = f"in slow motion: the fleet's clock runs at {status.pace:g} of real time"
     sections: tuple[tuple[str, Iterable[str]], ...] = (
         (" {}", [_describe_lead(status.lead)]),
         (" [bold yellow]way out[/], {}", _describe_ways_out(status)),
@@ -189,7 +189,7 @@ HOT_S: Final = 60.0
 
 
 def _heat_cell(celsius: tuple[float, float] | None, left_s: float | None) -> str | Text:
-    """Return the warmer winding, and the seconds left at this load where they are few."""
+    """Return the warmer winding's temperature, and the seconds left at this load if below 1 h."""
     if celsius is None or left_s is None:
         return "-"
     words = f"{max(celsius):.0f} C"
@@ -203,13 +203,13 @@ def _state_cell(state: str) -> str | Text:
 
 
 def warn_of_others(console: Console, own: Path | None = None) -> None:
-    """Print a line for each fleet that runs on this machine, but for one's own."""
+    """Print a line for each other fleet on this machine."""
     for other in sorted(procfs.fleets()):
         if own is None or Path(other) != own:
             console.print(
                 marked(
-                    "[yellow]another fleet runs in {}: two do not fit on two cores, and drives "
-                    "of either may be lost; `xrl down --run-dir {}` stops it[/]",
+                    "[yellow]another fleet runs in {}: two cores are too few for both, and either "
+                    "may lose drives; `xrl down --run-dir {}` stops it[/]",
                     other,
                     shlex.quote(other),
                 ),

@@ -1,7 +1,7 @@
-"""A fleet of services under supervisord: start, look, signal, stop.
+"""A fleet of services under supervisord: start, inspect, signal, stop.
 
-supervisord restarts what ends (`tools.fleet.supervisor_process`). If it dies, the services of a
-robot go on: they keep it standing. They are then found by their environment (`tools.fleet.procfs`).
+supervisord restarts services that end (`tools.fleet.supervisor_process`). If it dies, a robot's
+services keep running, so the robot stands; `tools.fleet.procfs` finds them by their environment.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from tools.fleet.supervisor_client import RefusedError, ServiceInfo, Supervisor
 
 _POLL_S = 0.1
 _LOOK_S = 0.5
-"""Period at which a start's progress is looked at."""
+"""Period of the check of a start's progress, s."""
 _USED_S = 0.05
-"""Processor time that is progress, s."""
+"""CPU time that counts as progress, s."""
 START_MAX_S = 600.0
-"""Timeout of a start that makes progress."""
-_KILLED_S = 5.0  # until the kernel has cleared away what SIGKILL has ended
+"""Timeout of a start that makes progress, s."""
+_KILLED_S = 5.0  # timeout for the kernel to clear away killed processes
 _LOOPS = 3
-"""Ends within a minute from which on a service is in a crash loop."""
+"""Ends within a minute from which a service is in a crash loop."""
 _FAILED = ("backoff", "exited", "fatal")
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _BY_DEFAULT = FleetOptions()
@@ -47,21 +47,21 @@ class SupervisedFleet:
     """The services of one run directory."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Name a fleet that may be up; `start` and `attach` make sure of it."""
+        """Name a fleet that may be up; `start` and `attach` check it."""
         self.run = RunDir(run_dir)
         self._supervisor = Supervisor(self.run)
         self._process: subprocess.Popen[bytes] | None = None
 
     @classmethod
     def start(cls, config_path: Path, run_dir: Path, options: FleetOptions = _BY_DEFAULT) -> Self:
-        """Start the services of a robot file and wait until every one is up.
+        """Start the services of a robot file and wait until every service is up.
 
         If it is interrupted or fails, it stops the started services; the logs of a failure stay.
 
         Raises:
             ConfigError: the robot file or the table cannot be used.
-            FleetError: the run directory or an endpoint is in use, a service is unknown,
-                ends at once or is not up in time; or drives are to be emulated on USB and
+            FleetError: the run directory or an endpoint is in use; a service is unknown,
+                ends at once or is not up in time; or USB drives must be emulated and
                 there is no C compiler.
         """
         started = cls(run_dir)
@@ -74,7 +74,7 @@ class SupervisedFleet:
         check_pace(clock_pace, simulated=simulated)
         files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
         if 0 <= files < FILES_MIN:
-            raise FleetError(f"{files} files may be open, and a fleet needs {FILES_MIN}: ulimit -n")
+            raise FleetError(f"limit of {files} open files, need {FILES_MIN}: raise ulimit -n")
         lock = started.run.claim()
         try:
             started._end_unsupervised(take_over=options.disarmed and not simulated)
@@ -93,8 +93,8 @@ class SupervisedFleet:
         if run.read_manifest() is None:
             if running:
                 raise FleetError(
-                    f"{run.path}: {len(running)} processes of a fleet run, and its files are gone; "
-                    "`xrl estop` stops the robot, `xrl down` ends them"
+                    f"{run.path}: {len(running)} processes of a fleet run, but its files are gone; "
+                    "`xrl estop` stops the robot, `xrl down` ends the processes"
                 )
             raise _not_up(run)
         if fault := attached.supervision_fault():
@@ -105,7 +105,7 @@ class SupervisedFleet:
         return attached
 
     def supervision_fault(self) -> str:
-        """Return why nothing restarts what ends, and the way out; empty if all is well."""
+        """Return why ended services are not restarted, and the remedy; empty without a fault."""
         try:
             self._supervisor.call("supervisor.getState")
         except FleetError as error:
@@ -131,7 +131,7 @@ class SupervisedFleet:
             raise
 
     def lost_lines(self) -> tuple[int, str]:
-        """Return how many log lines no disk took, and why; none where nobody knows."""
+        """Return the number of log lines that could not be written, and why; 0 if unknown."""
         try:
             return self._supervisor.lost_lines()
         except FleetError:
@@ -142,7 +142,7 @@ class SupervisedFleet:
         return procfs.service_pids(self.run.path)
 
     def kill(self, service: str, number: int = signal.SIGKILL) -> int:
-        """Send a signal to a service, at once, and return the process id it went to."""
+        """Send a signal to a service at once, and return the process id."""
         process_table.check_known([service], self.manifest.services)
         pid = self.pids().get(service)
         if pid is None:
@@ -150,14 +150,14 @@ class SupervisedFleet:
         try:
             os.kill(pid, number)
         except ProcessLookupError:
-            raise FleetError(f"{service} (pid {pid}) has just ended by itself") from None
+            raise FleetError(f"{service} (pid {pid}) has just ended on its own") from None
         return pid
 
     def forget(self, service: str) -> str:
-        """Let the next process of a joint service arm its drive, whatever state the last left.
+        """Let the next process of a joint service arm its drive, whatever state the last one left.
 
         Returns:
-            Why not, which is also logged; empty if the state is cleared.
+            Why that failed, which is also logged; empty if the state is cleared.
         """
         try:
             rearm_guard.clear(self.run.path, service)
@@ -171,7 +171,7 @@ class SupervisedFleet:
         return ""
 
     def crash_loop(self, service: str) -> str:
-        """Describe a service that ends again and again; empty if it does not."""
+        """Describe a service that ends again and again; empty if it is stable."""
         with contextlib.suppress(FleetError):
             for row in self.info():
                 if row.name == service and row.ends_lately >= _LOOPS:
@@ -186,7 +186,7 @@ class SupervisedFleet:
         """Restart joint services at the same moment; their next processes arm their drives.
 
         Raises:
-            FleetError: one has no process, or nothing would restart it; nothing was changed then.
+            FleetError: one has no process, or nothing would restart it; then nothing is changed.
         """
         if fault := self.supervision_fault():
             raise FleetError(f"nothing was restarted: {fault}")
@@ -197,9 +197,9 @@ class SupervisedFleet:
         procfs.signal_all([pids[module] for module in modules], signal.SIGKILL)
 
     def start_service(self, service: str) -> int | None:
-        """Start a service that is down, before any delayed restart; return None.
+        """Start a stopped service without waiting for a delayed restart; return None.
 
-        One that runs is left alone, and its process id returned.
+        If the service is running, return its process id and change nothing.
 
         A person has requested it, so a drive that lost torque is armed again
         (`services.joint.rearm_guard`). A suspended service is continued.
@@ -208,12 +208,12 @@ class SupervisedFleet:
         pid = self.pids().get(service)
         if pid is None:
             self.forget(service)
-            with contextlib.suppress(RefusedError):  # it ends the wait of a backoff
+            with contextlib.suppress(RefusedError):  # this ends the wait of a backoff
                 self._supervisor.call("supervisor.stopProcess", service)
             try:
                 self._supervisor.call("supervisor.startProcess", service, False)
             except RefusedError as refusal:
-                raise FleetError(f"{service}: cannot be started: {refusal}") from None
+                raise FleetError(f"{service}: cannot start: {refusal}") from None
         elif procfs.is_suspended(pid):
             os.kill(pid, signal.SIGCONT)
         else:
@@ -223,17 +223,17 @@ class SupervisedFleet:
     def stop(self, *, keep_logs: bool = False, keep_stops: bool = False) -> None:
         """Stop every service and the supervisor, and remove their files.
 
-        Each gets its own signal first, a suspended one too, and SIGKILL if it does not end in its
-        time. Without a fleet it does nothing. Only the logs, if wanted, and files that are not the
-        fleet's remain in the run directory; with `keep_stops` also an emergency stop.
+        Each service, even a suspended one, first gets its own signal, then SIGKILL after its
+        timeout. Without a fleet this does nothing. Only foreign files and requested logs remain
+        in the run directory; with `keep_stops` an emergency stop remains too.
         """
         self._end()
         if not self.run.is_marked:
-            return  # no fleet was ever here: nothing in it is ours
+            return  # there never was a fleet: no file here is a fleet's
         try:
             lock = self.run.claim(alone=False)
         except FleetError:
-            return  # the next fleet is starting here already, and has cleared up
+            return  # the next fleet is already starting here, and has cleaned up
         try:
             self._clear(keep_logs=keep_logs, keep_stops=keep_stops)
         finally:
@@ -263,21 +263,21 @@ class SupervisedFleet:
 
     @property
     def _is_supervised(self) -> bool:
-        """True while the supervisor that this process has started is alive."""
+        """True while the supervisor that this process started is alive."""
         return self._process is not None and self._process.poll() is None
 
     def _end_unsupervised(self, *, take_over: bool) -> None:
-        """End the services that a dead supervisor has left here, if their drives then hold."""
+        """End the services that a dead supervisor left here, provided that their drives hold."""
         left = procfs.fleet_pids(self.run.path)
         if not left:
             return
         if not take_over:
             raise FleetError(
                 f"{self.run.path}: {len(left)} processes of a fleet without a supervisor run here; "
-                "`xrl down` ends them, which lets go of the robot"
+                "`xrl down` ends them, which drops the robot"
             )
         procfs.signal_all(left, signal.SIGCONT)
-        procfs.signal_all(left, signal.SIGTERM)  # by which a drive goes on holding
+        procfs.signal_all(left, signal.SIGTERM)  # leaves the drives holding
         self._wait_or_kill(_KILLED_S)
 
     def _clear(self, *, keep_logs: bool, keep_stops: bool) -> None:
@@ -290,24 +290,24 @@ class SupervisedFleet:
         try:
             if manifest is None:
                 raise _not_up(self.run)
-            self._supervisor.call("supervisor.stopAllProcesses", False)  # all at once,
-            self._supervisor.call("supervisor.shutdown")  # which by itself goes one by one
+            self._supervisor.call("supervisor.stopAllProcesses", False)  # all at once, because
+            self._supervisor.call("supervisor.shutdown")  # this alone stops one after the other
         except FleetError:
-            # no supervisor, or none that answers: the processes are signalled directly
-            # (SIGINT: a joint service then leaves its drive idle)
+            # no supervisor answers: the processes are signalled directly
+            # (after SIGINT a joint service leaves its drive idle)
             procfs.signal_all(procfs.fleet_pids(self.run.path), signal.SIGINT)
         patience_s = (manifest.stop_s if manifest else 0.0) + 2.0
         self._wait_or_kill(patience_s)
 
     def _wait_or_kill(self, patience_s: float) -> None:
-        """Wait until every process of the fleet has ended; kill those that have not in time."""
+        """Wait until every process of the fleet has ended; kill the rest after a timeout."""
         left = procfs.wait_until_gone(self.run.path, patience_s)
         if left:
             procfs.signal_all(left, signal.SIGKILL)
             left = procfs.wait_until_gone(self.run.path, _KILLED_S)
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_POLL_S)  # else it stays a zombie of ours
+                self._process.wait(_POLL_S)  # otherwise it stays a zombie of this process
         if left:
             raise FleetError(f"processes {sorted(left)} did not end, even after SIGKILL")
 
@@ -315,7 +315,7 @@ class SupervisedFleet:
         leash = ["--parent", str(os.getpid())] if leashed else []
         command = [sys.executable, "-m", "tools.fleet.supervisor_process", *leash, "--"]
         command += ["--nodaemon", "--configuration", str(self.run.supervisor_config)]
-        # An interrupt between fork and exec would leave a process that nobody can find;
+        # An interrupt between fork and exec would leave a process that cannot be found;
         # `tools.fleet.supervisor_process` unblocks in the child.
         with _uninterrupted(), private_files(), self.run.supervisor_stderr.open("wb") as output:
             self._process = subprocess.Popen(
@@ -324,12 +324,12 @@ class SupervisedFleet:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                start_new_session=True,  # Ctrl-C in the terminal is for us alone
+                start_new_session=True,  # Ctrl-C in the terminal is only for this process
                 pass_fds=(lock,),
             )
 
     def _wait_until_up(self, plan: FleetPlan) -> None:
-        endpoints = {  # of a service that listens twice the first: its socket
+        endpoints = {  # for a service with two endpoints the first: its socket
             item.service: item.endpoint
             for item in reversed(plan.listeners)
             if item.key.startswith("bus.")
@@ -352,14 +352,14 @@ class SupervisedFleet:
                 raise FleetError(f"{words}\n{_tail(log)}".rstrip())
 
     def _used_s(self, services: Collection[str]) -> float:
-        """Return the processor time of some services; without any, that of their supervisor."""
+        """Return the CPU time of these services, or of their supervisor if none has a process."""
         pids = [pid for name, pid in self.pids().items() if name in services]
         if not pids and self._process is not None:
             pids = [self._process.pid]
         return sum(procfs.cpu_s_of(pids).values())
 
     def _info_or_none(self) -> list[ServiceInfo]:
-        """Return every service; none while the supervisor is still starting."""
+        """Return every service; empty while the supervisor is still starting."""
         if self._process is not None and self._process.poll() is not None:
             words = _tail(self.run.supervisor_stderr) or _tail(self.run.supervisor_log)
             raise FleetError(f"supervisord has ended while starting\n{words}".rstrip())
@@ -371,7 +371,7 @@ class SupervisedFleet:
             return []
 
     def _first_end(self, service: ServiceInfo) -> str:
-        """Return what to say of a service that ended while the fleet was starting."""
+        """Describe a service that ended while the fleet was starting."""
         log = self.run.log_of(service.name)
         how = service.last_exit or "could not be run"
         words = _tail(log) or service.last_line
@@ -379,10 +379,10 @@ class SupervisedFleet:
 
 
 class _ProgressWatch:
-    """Tells a start that is slow, on a busy machine, from one that does not go on.
+    """Distinguishes a slow start on a busy machine from a start that is stuck.
 
-    A service that comes up is progress, and so is processor time that the others use: their
-    imports take seconds of it.
+    A service that comes up is progress, and so is CPU time that the others use: their imports
+    take seconds of it.
     """
 
     def __init__(self, timeout_s: float, used_s: Callable[[Collection[str]], float]) -> None:
@@ -391,7 +391,7 @@ class _ProgressWatch:
         self._seen: tuple[int, float] = (0, 0.0)
 
     def look(self, waiting: Collection[str]) -> str:
-        """Return why the start has failed, or "" if it goes on."""
+        """Return why the start has failed, or "" while it makes progress."""
         now_s = time.monotonic()
         if now_s - self._looked_s >= _LOOK_S:
             self._looked_s = now_s
@@ -410,7 +410,7 @@ def _not_up(run: RunDir, why: str = "") -> FleetError:
 
 
 def _unsupervised(name: str, pid: int | None) -> ServiceInfo:
-    """Return what the kernel knows of a service whose supervisor is dead."""
+    """Return the kernel's information about a service whose supervisor is dead."""
     if pid is None:
         return ServiceInfo(name, None, "gone", 0.0)
     state = "suspended" if procfs.is_suspended(pid) else "unsupervised"

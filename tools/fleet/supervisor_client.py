@@ -1,4 +1,4 @@
-"""What supervisord says of its services, by XML-RPC over its UNIX socket."""
+"""Client of supervisord, by XML-RPC over its UNIX socket."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from tools.fleet.run_dir import RunDir
 _TIMEOUT_S = 3.0
 UNSUPERVISED: Final = (
     "running services continue and obey `xrl estop`, but nothing restarts one that ends: "
-    "hang the robot, then `xrl down`"
+    "hang the robot, then run `xrl down`"
 )
-"""What a dead supervisor means, and the way out."""
+"""Consequence of a dead supervisor, and the remedy."""
 
 
 class ServiceInfo(msgspec.Struct, frozen=True):
@@ -38,15 +38,15 @@ class ServiceInfo(msgspec.Struct, frozen=True):
     restarts: int = 0
     """Starts since the first one, wanted or not."""
     last_exit: str = ""
-    """How it ended last, for example "terminated by SIGKILL"; empty if it never has."""
+    """Its last end, for example "terminated by SIGKILL", or an empty string."""
     last_line: str = ""
-    """Newest line of its log, also if no disk took it."""
+    """Newest line of its log, even if it could not be written to disk."""
     ends_lately: int = 0
-    """How often it ended within the last minute."""
+    """Number of ends within the last minute."""
 
 
 class RefusedError(FleetError):
-    """The supervisor answered and refused the request."""
+    """The supervisor answered, but refused the request."""
 
 
 class Supervisor:
@@ -61,12 +61,12 @@ class Supervisor:
         return [_service_info(rows[name]) for name in services]
 
     def lost_lines(self) -> tuple[int, str]:
-        """Return how many log lines no disk took, and why the newest was lost."""
+        """Return the number of log lines that were not written, and why the newest was lost."""
         answer = self.call("xrl.logs")
         return answer["lost"], answer["why"]
 
     def call(self, method: str, *arguments: object) -> Any:
-        """Call the supervisor; the method has its namespace, `supervisor` or `xrl`."""
+        """Call a method of the supervisor, given with its namespace, `supervisor` or `xrl`."""
         transport = _Transport(self._run.supervisor_socket)
         try:
             with xmlrpc.client.ServerProxy("http://localhost", transport=transport) as proxy:
@@ -80,7 +80,7 @@ class Supervisor:
 
 
 class _Transport(SupervisorTransport):  # type: ignore[misc]  # supervisor has no types
-    """XML-RPC over the supervisor's socket, with a time limit."""
+    """XML-RPC over the supervisor's socket, with a timeout."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(None, None, f"unix://{path}")

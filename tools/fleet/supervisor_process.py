@@ -1,9 +1,9 @@
 """supervisord that needs no disk: `python -m tools.fleet.supervisor_process -- ARGUMENTS`.
 
-Supervision must stand a full, read-only or vanished disk. A log line that cannot be written is
-counted and dropped; the file is tried again at each line. The services outlive their supervisor:
-they are what keeps a robot standing, and they still hear an emergency stop. With `--parent PID`,
-the fleet belongs to a tool and has no robot on it: it ends when that process or its supervisor
+Supervision must survive a full, read-only or vanished disk. A log line that cannot be written is
+counted and dropped, and the next line tries the file again. The services outlive their supervisor,
+because they keep the robot standing, and they still receive an emergency stop. With `--parent
+PID`, the fleet belongs to a tool and has no robot: it ends when that process or its supervisor
 dies.
 """
 
@@ -32,23 +32,23 @@ from tools.fleet import kept_state
 from tools.fleet.procfs import die_with_parent
 
 BACKOFF_MAX_S: Final = 5.0
-"""Longest wait before a service that ends at once is started again, s. supervisord adds a second
-each time without a bound: after 135 failed starts a mended service stayed down for two minutes."""
+"""Maximum wait before a service that ends at once is restarted, s. supervisord adds a second each
+time without limit: after 135 failed starts a repaired service stayed down for two minutes."""
 LATELY_S: Final = 60.0
-"""Time over which the ends of a service are counted."""
+"""Window over which the ends of a service are counted, s."""
 NEWEST_MAX: Final = 300
-"""Bytes of a log's newest line that are kept."""
+"""Maximum length of the newest log line that is kept, bytes."""
 
 
 class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no types
-    """A log that rotates, comes back after its folder was removed, and never raises."""
+    """A log that rotates, is recreated after its folder was removed, and never raises."""
 
     lost = 0
     """Lines that could not be written, in all logs of this process."""
     why = ""
-    """Why the newest of them could not."""
+    """Why the newest of them was lost."""
     newest: ClassVar[dict[str, str]] = {}
-    """By file: its newest line, also where no disk took it."""
+    """Newest line of each file, even if it could not be written."""
 
     def __init__(self, filename: str, _mode: str, maxBytes: int, _backups: int) -> None:
         super().__init__(None)
@@ -60,7 +60,7 @@ class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no type
             self._open()
 
     def emit(self, record: loggers.LogRecord) -> None:
-        """Write one record; drop it if the disk does not take it."""
+        """Write a record, or drop it if the disk rejects it."""
         message = record.msg
         text = message if isinstance(message, bytes) else (self.fmt % record.asdict()).encode()
         if words := text.strip():
@@ -80,10 +80,10 @@ class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no type
             _LogFile.lost, _LogFile.why = _LogFile.lost + 1, error.strerror or str(error)
 
     def flush(self) -> None:
-        """Do nothing: nothing is buffered."""
+        """Do nothing, because nothing is buffered."""
 
     def close(self) -> None:
-        """Close the file; the next line opens it."""
+        """Close the file; the next line reopens it."""
         if self.stream is not None:
             self.stream.close()
             self.stream = None
@@ -114,7 +114,7 @@ class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no type
 
 
 class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no types
-    """One service: how often it was started and how it ended are kept without a log."""
+    """One service; it counts its starts and remembers how it ended, without a log."""
 
     starts = 0
     last_exit = ""
@@ -131,20 +131,20 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
         return pid
 
     def finish(self, pid: int, status: int) -> None:
-        """Note how the process ended."""
+        """Record how the process ended."""
         self.last_exit = decode_wait_status(status)[1]
         self._ends_s.append(time.monotonic())
         super().finish(pid, status)
 
     def change_state(self, new_state: int, expected: bool = True) -> Any:
-        """Take a new state; a delayed start waits for a bounded time."""
+        """Enter a new state, and limit the wait of a delayed start."""
         changed = super().change_state(new_state, expected)
         if new_state == ProcessStates.BACKOFF:
             self.delay = min(self.delay, time.time() + BACKOFF_MAX_S)
         return changed
 
     def row(self) -> dict[str, Any]:
-        """Return what is known of it; XML-RPC has no None."""
+        """Return the service's state as a row; XML-RPC has no None."""
         return {
             "name": self.config.name,
             "pid": self.pid or 0,
@@ -158,7 +158,7 @@ class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no ty
 
 
 class _FleetInterface:
-    """What `tools.fleet.supervisor_client` calls as `xrl.services` and `xrl.logs`."""
+    """The calls `xrl.services` and `xrl.logs` of `tools.fleet.supervisor_client`."""
 
     def __init__(self, supervisor: Any) -> None:
         self._supervisor = supervisor
@@ -169,7 +169,7 @@ class _FleetInterface:
         return [service.row() for group in groups for service in group.processes.values()]
 
     def logs(self) -> dict[str, Any]:
-        """Return how many log lines were lost, and why the newest was."""
+        """Return the number of lost log lines, and why the newest was lost."""
         return {"lost": _LogFile.lost, "why": _LogFile.why}
 
 
@@ -185,19 +185,19 @@ class _Options(ServerOptions):  # type: ignore[misc]  # supervisor has no types
     _supervisor_pid = os.getpid()
 
     def setpgrp(self) -> None:
-        """Put a leashed service on its leash; supervisord calls this first thing after fork."""
+        """Tie a leashed service to the supervisor; supervisord calls this right after fork."""
         super().setpgrp()
         if self.leashed:
             die_with_parent(self._supervisor_pid, signal.SIGKILL)
 
     def cleanup_fds(self) -> None:
-        """Keep the inherited descriptors: one of them holds the run directory's lock."""
+        """Keep the inherited descriptors, because one of them holds the run directory's lock."""
 
 
 def main() -> None:
     """Run supervisord in this process until it is stopped."""
-    os.umask(0o077)  # logs, sockets and shared memory, whoever starts the fleet
-    # The tool that starts us blocks signals meanwhile, and a mask is inherited.
+    os.umask(0o077)  # for logs, sockets and shared memory
+    # The tool that starts this process blocks signals during the start, and the mask is inherited.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     parser = FlagParser(description=__doc__)
     parser.add_argument("--parent", type=int, help="stop the fleet when this process dies")
@@ -209,14 +209,14 @@ def main() -> None:
     loggers.RotatingFileHandler = _LogFile
     process.Subprocess = Service
     supervisord.ServerOptions = _Options
-    # As `run_dir.one_line` writes it: a value is what stands there, whatever characters it has.
+    # `run_dir.one_line` writes values literally, whatever characters they contain.
     options.UnhosedConfigParser = partial(options.UnhosedConfigParser, inline_comment_prefixes=None)
     options.expand = lambda value, _expansions, _name: value
     scheduling.keep_processors_awake()  # until this process ends; no service inherits it
     run_dir = Path(os.environ[FLEET_VARIABLE])
     events.subscribe(events.Tick5Event, lambda _event: kept_state.save(run_dir))
     supervisord.main([word for word in args.arguments if word != "--"])
-    sys.stderr.close()  # on a full disk it could not be flushed, which would be an exit code
+    sys.stderr.close()  # on a full disk its flush would fail and change the exit code
 
 
 if __name__ == "__main__":

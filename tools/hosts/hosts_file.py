@@ -22,21 +22,21 @@ class Host(Section, frozen=True):
 
     name: str
     address: str
-    """By which the other hosts dial it: an IP address."""
+    """IP address by which the other hosts dial it."""
     ssh: str
-    """As `ssh` takes it: `root@10.0.0.2`, or a name in ~/.ssh/config. It may start units."""
+    """Destination for `ssh`: `root@10.0.0.2`, or a name in ~/.ssh/config. It may start units."""
     services: tuple[str, ...]
     tools: tuple[str, ...] = (VIEWER,)
-    """Whose key its tools have."""
+    """Principals whose key its tools have."""
     processors: str = ""
-    """As systemd takes them: `2-3`; empty: all."""
+    """Processors in systemd's notation: `2-3`; empty for all."""
     record: bool = True
-    """Where the recorder is another host's: keep a record of this one's services here. It is a
-    reader like any tool: without the key of one there is none."""
+    """If the recorder is on another host: also record this host's services here. That is a reader
+    like any tool, so without a tool's key there is no record."""
 
     @property
     def processes(self) -> tuple[str, ...]:
-        """What `xrl up --only` starts here."""
+        """Processes that `xrl up --only` starts here."""
         beside = self.record and bool(self.tools) and RECORDER not in self.services
         return (*self.services, HOST_RECORDER) if beside else self.services
 
@@ -50,29 +50,29 @@ class Hosts(Section, frozen=True):
     allow: tuple[str, ...] = ()
     """Further addresses that may link to the services: those of laptops with tools."""
     user: str = "xrl"
-    """Who runs the services."""
+    """User who runs the services."""
     checkout: str = "/opt/xrl"
     folder: str = "/etc/xrl"
-    """Where robot file, gain schedule and keys lie on each host."""
+    """Folder of robot file, gain schedule and keys on each host."""
     ssh: tuple[str, ...] = (
         "ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=5", "-o", "ServerAliveInterval=5",
     )  # fmt: skip
 
     def host_of(self, service: str) -> Host:
-        """Return where a service runs."""
+        """Return the host on which a service runs."""
         return next(host for host in self.host if service in host.services)
 
     def named(self, names: tuple[str, ...]) -> tuple[Host, ...]:
-        """Return hosts by their names; all of them without any."""
+        """Return hosts by their names; without names, all hosts."""
         known = {host.name: host for host in self.host}
         for name in names:
             if name not in known:
-                raise ConfigError("HOST", name, "no such host", f"one of {', '.join(known)}")
+                raise ConfigError("HOST", name, "no such host", f"use one of {', '.join(known)}")
         return tuple(known[name] for name in names or known)
 
 
 Problems = Iterator[tuple[str, str, str]]
-"""Key, what is found there, and what would be right."""
+"""Key, value found there, and correct value."""
 
 
 def load(path: Path, robot: RobotConfig) -> Hosts:
@@ -90,56 +90,56 @@ def _problems(hosts: Hosts, robot: RobotConfig) -> Problems:
     homes = {service: host.name for host in hosts.host for service in host.services}
     absent = [service for service in _real_services(robot) if service not in homes]
     if absent:
-        yield "host", f"{', '.join(absent)} runs nowhere", "each on one host"
+        yield "host", f"no host runs {', '.join(absent)}", "each must run on one host"
     for side in SIDES:
         if len({homes.get(name) for name in MODULES if side_of(name) == side}) > 1:
-            right = "one: they see each other's failures in shared memory (docs/hosts.md)"
+            right = "use one: they see each other's failures in shared memory (docs/hosts.md)"
             yield "host", f"the {side} leg's services are on several hosts", right
     for index, address in enumerate(hosts.allow):
         yield from _of_address(f"allow[{index}]", address)
     for key, value in (("checkout", hosts.checkout), ("folder", hosts.folder)):
         if not re.fullmatch(r"/[A-Za-z0-9_./-]+", value):
-            yield key, f"{value!r}", "an absolute path without spaces"
+            yield key, f"{value!r}", "must be an absolute path without spaces"
     if not re.fullmatch(r"[a-z_][a-z0-9_-]*", hosts.user):
-        yield "user", f"{hosts.user!r}", "a user's name"
+        yield "user", f"{hosts.user!r}", "must be a user's name"
 
 
 def _of_host(host: Host, before: tuple[Host, ...], known: tuple[str, ...]) -> Problems:
     if not re.fullmatch(r"[A-Za-z0-9_-]+", host.name):
-        yield "name", f"{host.name!r}", "letters, digits, _ and - only"
+        yield "name", f"{host.name!r}", "must have letters, digits, _ and - only"
     yield from _of_address("address", host.address)
     if host.ssh.startswith("-") or not host.ssh.strip():
-        yield "ssh", f"{host.ssh!r}", "as ssh takes it: user@host"
+        yield "ssh", f"{host.ssh!r}", "must be an ssh destination: user@host"
     for key, value in (("name", host.name), ("address", host.address)):
         if value in (getattr(other, key) for other in before):
-            yield key, f"{value!r} stands twice", "one each"
+            yield key, f"{value!r} is used twice", "must be unique"
     if host.processors and not re.fullmatch(r"\d+(-\d+)?([ ,]\d+(-\d+)?)*", host.processors):
-        yield "processors", f"{host.processors!r}", "as systemd takes them: 0-1,3"
+        yield "processors", f"{host.processors!r}", "must be in systemd's notation: 0-1,3"
     if not host.services:
-        yield "services", "none", "at least one"
+        yield "services", "none", "must have at least one"
     for service in host.services:
         other = next((other.name for other in before if service in other.services), host.name)
         if service not in known:
-            yield "services", f"no service {service!r}", f"one of {', '.join(known)}"
+            yield "services", f"no service {service!r}", f"must be one of {', '.join(known)}"
         if other != host.name or host.services.count(service) > 1:
-            yield "services", f"{service!r} is {other}'s too", "once"
+            yield "services", f"{service!r} is also on {other}", "must be listed once"
     for tool in host.tools:
         if tool not in _TOOLS:
-            yield "tools", f"{tool!r}", f"one of {', '.join(_TOOLS)}"
+            yield "tools", f"{tool!r}", f"must be one of {', '.join(_TOOLS)}"
 
 
 def _of_address(key: str, text: str) -> Problems:
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
-        yield key, f"{text!r}", "an IP address: names can be forged"
+        yield key, f"{text!r}", "must be an IP address: names can be forged"
         return
     if address.is_unspecified or address.is_multicast:
-        yield key, f"{text!r}", "the address of one host"
+        yield key, f"{text!r}", "must be the address of one host"
 
 
 def _real_services(robot: RobotConfig) -> tuple[str, ...]:
-    """Return what runs on a real robot's hosts."""
+    """Return the services that run on a real robot's hosts."""
     return tuple(service for service in robot.services if service != "simulator")
 
 

@@ -1,4 +1,4 @@
-"""Each host's files: what is in them, how they get there, and whether they are right."""
+"""Each host's files: their contents, their transfer, and the check whether they are right."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ KEYS: Final = "keys"
 FIREWALL: Final = "xrl.nft"
 UNIT: Final = "xrl.service"
 RUN_DIR: Final = "/var/lib/xrl/run"
-"""On the disk and not in memory: an emergency stop outlasts a power cut, once the kernel has
-written it, within half a minute."""
+"""On the disk, not in memory: an emergency stop outlasts a power cut once the kernel has written
+it, within half a minute."""
 
 NFT: Final = "/usr/sbin/nft"
 
@@ -50,18 +50,18 @@ def robot_on_hosts(robot: RobotConfig, hosts: Hosts) -> RobotConfig:
 def unit(hosts: Hosts, host: Host) -> str:
     """Return the systemd unit that runs a host's services.
 
-    It comes back after a crash and after a power cut, and arms no drive then: a drive that still
+    It restarts after a crash and after a power cut, and then arms no drive: a drive that still
     holds is taken over, and any other waits for a person.
     """
     xrl = f"{hosts.checkout}/.venv/bin/xrl"
     processors = f"CPUAffinity={host.processors}\n" if host.processors else ""
-    # Joint services throw old frames away by a restart of the CAN interface (docs/drives.md).
+    # Joint services discard old frames by restarting the CAN interface (docs/drives.md).
     granted = "CAP_NET_ADMIN" if set(host.services) & set(MODULES) else ""
     capabilities = f"CapabilityBoundingSet={granted}"
     if granted:
         capabilities += f"\nAmbientCapabilities={granted}"
     return f"""\
-# Made by `xrl hosts`; what it is for stands in docs/hosts.md.
+# Made by `xrl hosts`; docs/hosts.md explains it.
 [Unit]
 Description=Extra Robotic Legs: {", ".join(host.services)}
 After=network-online.target
@@ -70,17 +70,17 @@ Wants=network-online.target
 [Service]
 Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
-# As root. The services start without it, too: strangers can only keep new links off.
+# As root. If it fails, the services still start: strangers can then only block new links.
 ExecStartPre=+-{NFT} -f {hosts.folder}/{FIREWALL}
 ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
   --run-dir {RUN_DIR} --only {",".join(host.processes)}
 ExecStop={xrl} down --limp --keep-stops --run-dir {RUN_DIR}
 Restart=always
 RestartSec=2
-# A start that is cut short would idle the drives of what is up.
+# An interrupted start would idle the drives of services that are up.
 TimeoutStartSec=infinity
 TimeoutStopSec=30
-# Nor are they all to go because one process took too much memory.
+# One process that takes too much memory must not end the others.
 OOMPolicy=continue
 OOMScoreAdjust=-500
 User={hosts.user}
@@ -111,7 +111,7 @@ WantedBy=multi-user.target
 
 
 def firewall(robot: RobotConfig) -> str:
-    """Return the rules by which only the robot's hosts and `allow` reach the services' ports."""
+    """Return the rules that let only the robot's hosts and `allow` reach the services' ports."""
     ends = [host_and_port(endpoint) for endpoint in robot.bus.endpoints.values()]
     addresses = sorted({*(host for host, _ in ends), *robot.bus.security.allow})
     elements = {
@@ -139,7 +139,7 @@ class HostFile(NamedTuple):
     path: str
     content: bytes
     of_service: bool = False
-    """True: it belongs to who runs the services, and is theirs alone; else to root."""
+    """True if only the services' user may read it; otherwise it belongs to root."""
 
 
 class HostRow(NamedTuple):
@@ -159,7 +159,7 @@ class HostRow(NamedTuple):
 def files_of(
     hosts: Hosts, host: Host, robot: RobotConfig, schedule: bytes, authority: Authority | None
 ) -> list[HostFile]:
-    """Return what a host has to have; without an authority all but its keys."""
+    """Return the files that a host must have; without an authority, all but its keys."""
     spread = robot_on_hosts(robot, hosts)
     folder = hosts.folder
     files = [
@@ -177,7 +177,7 @@ def files_of(
 
 
 def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: bool) -> str:
-    """Bring files to a host, and take away keys that it is not to have; a start takes them."""
+    """Copy files to a host, and delete keys that it must not have; a start applies them."""
     if not while_up:
         _refuse_up(remote)
     folder = hosts.folder
@@ -207,13 +207,13 @@ def _refuse_up(remote: Remote) -> None:
     state = _state(remote)
     if state not in _AT_REST:
         raise FleetError(
-            f"{remote.host.name}: its unit is {state}: a service that crashes would come back with "
-            "the new files beside the old; `xrl hosts down` first, or --while-up"
+            f"{remote.host.name}: its unit is {state}: a service that crashes would restart with "
+            "the new files beside the old; run `xrl hosts down` first, or use --while-up"
         )
 
 
 def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
-    """Look at a host, and compare it with what it has to have."""
+    """Check a host against the files that it must have."""
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
     # the module is found in the installed package, wherever the command starts
     words = ("-P", "-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
@@ -221,23 +221,23 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
     try:
         probe = msgspec.json.decode(line.encode(), type=Probe)
     except msgspec.DecodeError:
-        raise FleetError(f"{remote.host.name}: {hosts.checkout} is of another version") from None
+        raise FleetError(f"{remote.host.name}: {hosts.checkout} has another version") from None
     wanted = {Path(file.path).name: digest(file.content) for file in files if not file.of_service}
     wrong = list(probe.wrong)
     if probe.robot != wanted[ROBOT_FILE]:
-        wrong.append("another robot file; `xrl hosts update`")
+        wrong.append("its robot file differs; run `xrl hosts update`")
     if probe.schedule != wanted[SCHEDULE]:
-        wrong.append("another gain schedule; `xrl hosts update`")
+        wrong.append("its gain schedule differs; run `xrl hosts update`")
     wrong += _about_keys(probe, {Path(f.path).name: f.content for f in files if f.of_service})
     if digest(remote.run("cat", f"{_UNIT_FOLDER}/{UNIT}").out.encode()) != wanted[UNIT]:
-        wrong.append(f"another {UNIT}; `xrl hosts update`")
+        wrong.append(f"its {UNIT} differs; run `xrl hosts update`")
     state, warnings = _state(remote), list(probe.warnings)
     if state not in _AT_REST and remote.run(NFT, "list", "table", "inet", "xrl").code:
-        warnings.append(f"no firewall at its ports: `nft -f {hosts.folder}/{FIREWALL}`")
+        warnings.append(f"no firewall on its ports; run `nft -f {hosts.folder}/{FIREWALL}`")
     if not probe.revision:
-        wrong.append(f"of no known version: {hosts.checkout} is no git checkout that can be read")
+        wrong.append(f"version unknown: {hosts.checkout} is not a readable git checkout")
     if probe.revision.endswith("+"):
-        warnings.append(f"{hosts.checkout} has changes of its own")
+        warnings.append(f"{hosts.checkout} has local changes")
     return HostRow(
         name=remote.host.name,
         reached=True,
@@ -250,18 +250,18 @@ def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
 
 
 def _about_keys(probe: Probe, wanted: dict[str, bytes]) -> list[str]:
-    """Return what is wrong with a host's keys against those that it is to have."""
+    """Return how a host's keys differ from those that it must have."""
     wrong = []
     wanted_now = {name: digest(content) for name, content in wanted.items()}
     other = sorted(n for n, found in wanted_now.items() if probe.keys.get(n) != found)
     extra = sorted(set(probe.keys) - set(wanted))
     if NAMES in other:
-        wrong.append("lets in other generations than the authority; `xrl hosts update`")
+        wrong.append("accepts other key generations than the authority; run `xrl hosts update`")
         other.remove(NAMES)
     if other:
-        wrong.append(f"other keys than the authority's: {', '.join(other)}; `xrl hosts update`")
+        wrong.append(f"other keys than the authority's: {', '.join(other)}; run `xrl hosts update`")
     if wanted and extra:
-        wrong.append(f"keys that it is not to have: {', '.join(extra)}; `xrl hosts update`")
+        wrong.append(f"keys that it must not have: {', '.join(extra)}; run `xrl hosts update`")
     return wrong
 
 
@@ -270,13 +270,13 @@ def _state(remote: Remote) -> str:
 
 
 def disagreements(rows: list[HostRow]) -> list[str]:
-    """Return what is not the same on all hosts that were reached."""
+    """Return the values that differ between the hosts that were reached."""
     wrong = []
     for word, value_of in _SAME_ON_ALL.items():
         found = {row.name: value_of(row) for row in rows if row.reached}
         if len(set(found.values())) > 1:
             rest = ", ".join(f"{name} {value or 'none'}" for name, value in found.items())
-            wrong.append(f"several {word}: {rest}")
+            wrong.append(f"different {word}: {rest}")
     return wrong
 
 

@@ -1,4 +1,4 @@
-"""What `xrl hosts check` asks a host: one line of JSON.
+"""Self-check of a host for `xrl hosts check`: one line of JSON.
 
 python -m tools.hosts.probe --config /etc/xrl/robot.toml --run-dir /var/lib/xrl/run
 """
@@ -28,31 +28,31 @@ from tools.keys.authority import held_files
 from tools.keys.inspection import inspect_keys
 
 FREE_MIB: Final = 4096
-"""Less is warned of: an hour of records is 2.4 GiB."""
+"""Free space below which it warns, MiB: an hour of records is 2.4 GiB."""
 LOCKS: Final = ("requirements.lock", "requirements.runtime.lock")
 
 
 class Probe(msgspec.Struct, frozen=True):
-    """What a host says of itself."""
+    """Facts that a host reports about itself."""
 
     revision: str
-    """Commit of the code; "+": with changes. Empty: not known."""
+    """Commit of the code, with "+" if it has changes; empty if unknown."""
     lock: str
-    """Hash of what the environment was made from."""
+    """Hash of the lock file of the runtime environment."""
     python: str
     robot: str
     """Hash of the robot file."""
     schedule: str
-    """Hash of the gain schedule; empty: there is none."""
+    """Hash of the gain schedule; empty without one."""
     keys: dict[str, str]
-    """Hash of each file of keys, by its name."""
+    """Hash of each key file, by its name."""
     wrong: tuple[str, ...]
-    """What keeps the services from starting: the robot file, keys."""
+    """Problems that keep the services from starting: the robot file, keys."""
     warnings: tuple[str, ...]
 
 
 def probe(config: Path, run_dir: Path) -> Probe:
-    """Look at this host."""
+    """Check this host."""
     wrong, warnings, keys = [], [], dict[str, str]()
     try:
         robot = config_file.load(config)
@@ -62,26 +62,23 @@ def probe(config: Path, run_dir: Path) -> Probe:
             warnings += [f"{row.name}: {row.warning}"] if row.warning else []
         keys = {name: _hash_of(folder / name) for name in (NAMES, *held_files(folder))}
         if _is_older(run_dir / SUPERVISOR_PID, folder / NAMES):
-            warnings.append("its services run since before it knew who is let in: restart them")
+            warnings.append("its services started before its accepted keys changed; restart them")
     except (XrlError, OSError) as error:
         wrong.append(str(error))
     if not IS_CHECKOUT:
-        warnings.append(
-            f"{CHECKOUT}: a wheel, no checkout: which lock its packages are of is not known"
-        )
+        warnings.append(f"{CHECKOUT}: a wheel, not a checkout: the lock of its packages is unknown")
     elif not _environment_is_current():
-        warnings.append(f"{CHECKOUT}: the environment is not that of this version: deploy/install")
+        warnings.append(f"{CHECKOUT}: the environment does not match the code; run deploy/install")
     free_mib = free_bytes_at(run_dir) // MIB
     if free_mib < FREE_MIB:
-        warnings.append(f"{free_mib} MiB free for records: take old ones away")
+        warnings.append(f"{free_mib} MiB free for records; delete old ones")
     if not clock_is_synchronised():
         warnings.append(f"its clock is not synchronised: {CLOCK_FIX}")
     pause_ms = scheduling.real_time_pause_ms()
     if pause_ms:
         warnings.append(
-            f"where services fill a processor the kernel stops them for {pause_ms:g} ms of each "
-            "second: "
-            f"`sysctl {scheduling.NO_PAUSE}`"
+            f"if services fill a processor, the kernel stops them for {pause_ms:g} ms of each "
+            f"second; run `sysctl {scheduling.NO_PAUSE}`"
         )
     return Probe(
         revision=_revision(),
@@ -135,7 +132,7 @@ def _revision() -> str:
 
 
 def main() -> None:
-    """Print what this host says of itself."""
+    """Print what this host reports about itself."""
     parser = FlagParser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--run-dir", type=Path, required=True)

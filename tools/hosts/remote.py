@@ -20,7 +20,7 @@ MARK: Final = "xrl-output-follows"
 
 
 class Said(NamedTuple):
-    """How a command ended."""
+    """Result of a command."""
 
     code: int
     out: str
@@ -28,12 +28,12 @@ class Said(NamedTuple):
 
 
 class _Manner(TypedDict, total=False):
-    """How a command runs on a host."""
+    """Options of a command on a host."""
 
     content: bytes
-    """For its standard input."""
+    """Data for its standard input."""
     as_user: bool
-    """As the user who runs the services, not as the one who logs in."""
+    """True to run it as the user who runs the services, not as the login user."""
     timeout_s: float
 
 
@@ -43,14 +43,14 @@ class Remote:
     def __init__(self, hosts: Hosts, host: Host) -> None:
         self.host = host
         self._begin = [*hosts.ssh, host.ssh]
-        # from a folder that every user may enter: find and others go back to where they began
+        # from a folder that every user may enter: find and others return to where they started
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
     def run(self, *words: str, **manner: Unpack[_Manner]) -> Said:
-        """Run a command, which no shell takes apart, and wait for it; how it ends is no error.
+        """Run a command without shell expansion, and wait for it; its failure is not an error.
 
         Raises:
-            FleetError: the host is not reached, or the command does not end in time.
+            FleetError: the host cannot be reached, or the command does not end in time.
         """
         timeout_s = manner.get("timeout_s", TIMEOUT_S)
         command, name = self._command(words, manner), self.host.name
@@ -60,12 +60,12 @@ class Remote:
                 check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            raise FleetError(f"{name}: {words[0]}: no end after {timeout_s:g} s") from None
+            raise FleetError(f"{name}: {words[0]}: did not end within {timeout_s:g} s") from None
         except OSError as error:
             raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
         errors = done.stderr.decode(errors="replace").strip()
         if done.returncode == 255:  # ssh's own
-            raise FleetError(f"{name}: {self.host.ssh} is not reached: {_last(errors)}")
+            raise FleetError(f"{name}: {self.host.ssh} cannot be reached: {_last(errors)}")
         noise, mark, out = done.stdout.decode(errors="replace").partition(f"{MARK}\n")
         if not mark:
             text = f"the shell of {self.host.ssh} did not run the command: {_last(errors or noise)}"
@@ -73,10 +73,10 @@ class Remote:
         return Said(done.returncode, out, errors)
 
     def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[_Manner]) -> None:
-        """Run a command, and hand on each line as it prints it.
+        """Run a command, and pass on each line as it is printed.
 
         Raises:
-            FleetError: the host is not reached, or the command fails.
+            FleetError: the host cannot be reached, or the command fails.
         """
         pipe = subprocess.PIPE
         command, name = self._command(words, manner), self.host.name
@@ -96,12 +96,12 @@ class Remote:
             raise FleetError(f"{name}: {_last(errors)}")
 
     def _command(self, words: Sequence[str], manner: _Manner) -> list[str]:
-        """Return what this computer runs to have a host run words; they print after `MARK`."""
+        """Return the local command that runs words on the host; they print after `MARK`."""
         before = self._as_user if manner.get("as_user") else []
         return [*self._begin, f"echo {MARK}; {shlex.join([*before, *words])}"]
 
     def must(self, *words: str, **manner: Unpack[_Manner]) -> str:
-        """Run a command that has to succeed, and return what it printed."""
+        """Run a command that must succeed, and return its output."""
         said = self.run(*words, **manner)
         if said.code != 0:
             why = _last(said.error) or f"exit status {said.code}"
@@ -109,7 +109,7 @@ class Remote:
         return said.out
 
     def write(self, path: str, content: bytes, *, private: bool) -> None:
-        """Write a file whole or not at all; a private one is the services' user's alone."""
+        """Write a file whole or not at all; a private file belongs to the services' user alone."""
         part, mode = shlex.quote(f"{path}.part"), 0o600 if private else 0o644
         script = (
             f"umask 077 && rm -f {part} && set -C && cat > {part} && chmod {mode:o} {part} && "
@@ -130,7 +130,7 @@ def on_all(
     work: Callable[[Remote], R],
     tell: Callable[[str, R | FleetError], None] = lambda _name, _result: None,
 ) -> dict[str, R | FleetError]:
-    """Do the same on all hosts at a time; a host that fails gives its error."""
+    """Do the same on all hosts at once; a host that fails gives its error."""
 
     def attempt(remote: Remote) -> R | FleetError:
         try:
@@ -148,6 +148,6 @@ def on_all(
 
 
 def _last(text: str) -> str:
-    """Return the last line of what a command said, without its control characters."""
+    """Return the last line of a command's output, without control characters."""
     lines = [line for line in text.splitlines() if line.strip()]
-    return printable(lines[-1]) if lines else "it said nothing"
+    return printable(lines[-1]) if lines else "it printed nothing"

@@ -1,4 +1,4 @@
-"""Starts, stops and looks at the services of hosts, by their units."""
+"""Starts, stops and queries the services of hosts, through their systemd units."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from tools.hosts.layout import RUN_DIR, UNIT, is_up
 from tools.hosts.remote import Remote
 
 HEARD_S: Final = 10.0
-"""A joint service that is up is heard within this time."""
+"""Timeout for the first state of a joint service, s."""
 ESTOP_S: Final = 10.0
-"""A host that has not answered by then has not stopped."""
+"""Timeout for a host's answer, s; a host that has not answered has not stopped."""
 _ARMABLE: Final = (DriveStatus.IDLE.name, DriveStatus.ERROR.name)
 
 
 def start(remote: Remote) -> str:
-    """Start a host's services; a drive that holds is taken over, and none is armed."""
+    """Start a host's services; they take over a drive that holds, and arm none."""
     remote.must("systemctl", "start", UNIT)
     return f"up: {', '.join(remote.host.services)}"
 
 
 def heard(hosts: Hosts, remote: Remote) -> FleetStatus:
-    """Return a host's status, once each of its own modules is heard."""
+    """Return a host's status, once each of its own modules reports."""
     deadline = time.monotonic() + HEARD_S
     while True:
         found = status(hosts, remote)
@@ -40,13 +40,13 @@ def heard(hosts: Hosts, remote: Remote) -> FleetStatus:
             return found
         if time.monotonic() > deadline:
             raise FleetError(
-                f"{remote.host.name}: {', '.join(silent)}: not heard for {HEARD_S:g} s, so nothing "
-                "is armed; `journalctl -u xrl` there"
+                f"{remote.host.name}: {', '.join(silent)}: no state for {HEARD_S:g} s, so nothing "
+                "is armed; see `journalctl -u xrl` there"
             )
 
 
 def stopped_in(found: Iterable[FleetStatus]) -> dict[str, str]:
-    """Return each module that an emergency stop holds, with who engaged it, or ""."""
+    """Return each module in an emergency stop, with who engaged it, or ""."""
     stopped: dict[str, str] = {}
     for one in found:
         for name, row in one.modules.items():
@@ -56,11 +56,11 @@ def stopped_in(found: Iterable[FleetStatus]) -> dict[str, str]:
 
 
 def arm(hosts: Hosts, remote: Remote, found: FleetStatus) -> str:
-    """Have the host's joint services arm the drives that are idle; what holds is left alone."""
+    """Have the host's joint services arm their idle drives; a drive that holds is left alone."""
     idle = [name for name in _modules_of(remote) if found.modules[name].drive in _ARMABLE]
     for module in idle:
         remote.must(_xrl(hosts), "kill", module, "--run-dir", RUN_DIR, as_user=True)
-    return f"drives of {', '.join(idle)} are armed" if idle else "no drive to arm"
+    return f"armed the drives of {', '.join(idle)}" if idle else "no drive to arm"
 
 
 def _modules_of(remote: Remote) -> list[str]:
@@ -68,7 +68,7 @@ def _modules_of(remote: Remote) -> list[str]:
 
 
 def estop(hosts: Hosts, remote: Remote) -> str:
-    """Stop a host's modules, by its shared memory."""
+    """Stop a host's modules, through its shared memory."""
     mine = _modules_of(remote)
     if not mine:
         return "no module here"
@@ -79,10 +79,10 @@ def estop(hosts: Hosts, remote: Remote) -> str:
 def lower(
     hosts: Hosts, remotes: Iterable[Remote], tell: Callable[[str], None], *, wait_s: float
 ) -> None:
-    """Have one host lower the robot until nothing bears on its legs; none is up: do nothing.
+    """Have one host lower the robot until its legs bear no weight; do nothing if no host is up.
 
     Raises:
-        FleetError: it bears weight, or nobody knows.
+        FleetError: the legs bear weight, or that is unknown.
     """
     try:
         up = [remote for remote in remotes if is_up(remote)]
@@ -96,7 +96,7 @@ def lower(
 
 
 def down(hosts: Hosts, remote: Remote) -> str:
-    """Stop a host's services, and forget an emergency stop: a person asks for that."""
+    """Stop a host's services, and clear an emergency stop, because a person requests that."""
     remote.must("systemctl", "stop", UNIT)
     remote.must(_xrl(hosts), "down", "--limp", "--run-dir", RUN_DIR, as_user=True)
     return "down"
@@ -109,11 +109,11 @@ def status(hosts: Hosts, remote: Remote) -> FleetStatus:
     try:
         return msgspec.json.decode(said.encode(), type=FleetStatus)
     except msgspec.DecodeError as error:
-        raise FleetError(f"{remote.host.name}: no status: {error}") from None
+        raise FleetError(f"{remote.host.name}: invalid status: {error}") from None
 
 
 def joined(found: dict[str, FleetStatus]) -> FleetStatus:
-    """Return one status of all hosts: a module as the first host that hears it has it."""
+    """Return one status of all hosts; each module's is from the first host that receives it."""
     services = {
         f"{host}: {name}": row for host, one in found.items() for name, row in one.services.items()
     }

@@ -1,1 +1,1 @@
-"""What a run was worth: verdict, soundness, stalls, figures, report."""
+"""Judgement of a run: verdict, soundness, stalls, figures, report."""

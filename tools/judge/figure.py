@@ -1,6 +1,6 @@
 """Files that a judged run leaves beside its log: `summary.json` and the picture `run.png`.
 
-The picture is like the paper's Fig. 7: COM and torso angles against time.
+The picture resembles the paper's Fig. 7: COM and torso angles against time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ INKS: Final = {
     "idle": "#d9d9d9", "warn": "#f2a65a", "good": "#4c9f70", "odd": "#8f5fbf", "bad": "#c0392b",
     "net": "#8f7fc8",
 }  # fmt: skip
-"""By the names of `COLOURS`."""
+"""Colours by the names in `COLOURS`."""
 LINES: Final = (
     "#1f4e79", "#c8553d", "#5b8c5a", "#8c2d19", "#4a90c4", "#e09f5b", "#7fc4d8", "#6b6b6b",
 )  # fmt: skip
@@ -46,16 +46,16 @@ EVENT_COLOURS: Final = {
     "kill": "#c0392b", "fall": "#c0392b", "estop": "#c0392b", "restart": "#2e7d32",
     "fault": "#b8590b", "network": "#3f2f6f",
 }  # fmt: skip
-"""By kind of event; grey for the others."""
+"""Colours by kind of event; the others are grey."""
 LABEL_ROWS: Final = 3
 """Rows of event names above the first panel."""
 
 
 def judge_run(out: Path, title: str, duration_s: float, **figures: float | None) -> Summary:
-    """Judge a run of a scenario of `duration_s`; write `summary.json` and `run.png` beside it.
+    """Judge a run of a scenario of `duration_s`, and write `summary.json` and `run.png` beside it.
 
-    The picture of a long run is that of its end. `figures` are fields of the summary that no log
-    tells.
+    The picture of a long run shows its end. `figures` are fields of the summary that are not in
+    the log.
     """
     path = out / "run.mcap"
     index = RunIndex(path, files_of_run(path, head_of(path)))  # a long record is split
@@ -74,7 +74,7 @@ def judge_run(out: Path, title: str, duration_s: float, **figures: float | None)
 
 
 def draw(log: RunLog, name: str, summary: Summary, path: Path) -> None:
-    """Draw a run into a PNG file."""
+    """Draw a run to a PNG file."""
     run = RunData(log)
     panels = panels_of(run)
     events = Events()
@@ -134,7 +134,7 @@ def _with_gaps(line: Line) -> tuple[Any, Any]:
 
 
 def _legend(axis: Any, handles: Sequence[Any], **more: Any) -> None:
-    """Put the legend beside the panel, where no curve is."""
+    """Put the legend beside the panel, clear of the curves."""
     usual = {
         "loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "fontsize": 8, "frameon": False,
         "borderaxespad": 0.2, "handlelength": 1.4, "labelspacing": 0.2,
@@ -161,7 +161,7 @@ def _bars(axis: Any, panel: Panel) -> None:
 
 
 def _events(axes: Any, events: Sequence[TimelineEvent], length_s: float) -> None:
-    """Mark events in every panel, with their names above the first."""
+    """Mark events in every panel, with their names above the first panel."""
     ends = [-np.inf] * LABEL_ROWS
     for event in events:
         colour = EVENT_COLOURS.get(event.kind, "#7f7f7f")
@@ -179,7 +179,7 @@ def _events(axes: Any, events: Sequence[TimelineEvent], length_s: float) -> None
 
 
 def _stalls(axes: Any, stalls: Sequence[ShownStall]) -> None:
-    """Shade stalls, and the time that is judged apart because of them."""
+    """Shade stalls, and the time that is judged separately because of them."""
     for row in stalls:
         end = row.at_s + row.lasted_ms / 1e3
         apart = row.apart_until_s if row.modules_held else end

@@ -1,4 +1,4 @@
-"""Which part of a run a command reads: `--from` and `--to`, on the time axis of the report."""
+"""Part of a run that a command reads: `--from` and `--to`, on the time axis of the report."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, parts_of, read_part
 
 _LOOK_S: Final = 20.0
-"""Length of the parts in which the scenario's start is looked for."""
+"""Length of the parts in which the scenario's start is searched, s."""
 
 
 class PartFlags(Flags):
-    """Part of a run: the whole of it if none is given."""
+    """Part of a run; by default all of it."""
 
     begin_s: Annotated[Number, option("--from", metavar="S")] = -math.inf
     """start of the part (default: the run's): scenario time, or time since the start of the log if
@@ -29,12 +29,12 @@ class PartFlags(Flags):
         super().check()
         if not self.begin_s < self.end_s:
             raise RunError(
-                f"--from {self.begin_s:g} --to {self.end_s:g}: the first is to be the smaller one"
+                f"--from {self.begin_s:g} --to {self.end_s:g}: --from must be less than --to"
             )
 
 
 def part_of(flags: PartFlags, index: RunIndex) -> RunPart:
-    """Return the part that a command line asks for."""
+    """Return the part that a command line requests."""
     begin_s, end_s = flags.begin_s, flags.end_s
     if math.isinf(begin_s) and math.isinf(end_s):
         return RunPart()
@@ -42,14 +42,14 @@ def part_of(flags: PartFlags, index: RunIndex) -> RunPart:
     first_s, last_s = 0.0 - offset_s, index.length_s - offset_s  # no -0
     if begin_s > last_s or end_s < first_s:
         raise RunError(
-            f"{index.path}: has nothing from {begin_s:g} to {end_s:g} s; it holds "
+            f"{index.path}: has nothing from {begin_s:g} to {end_s:g} s; it covers "
             f"{first_s:.2f} to {last_s:.2f} s"
         )
     return RunPart(max(0.0, begin_s + offset_s), end_s + offset_s)
 
 
 def read_asked(flags: PartFlags, index: RunIndex, *, as_sent: bool = False) -> RunLog:
-    """Read the part that a command line asks for, at once; `as_sent` as for `RunLog`."""
+    """Read the part that a command line requests, all at once; `as_sent` as for `RunLog`."""
     return read_part(index, part_of(flags, index), as_sent=as_sent)
 
 

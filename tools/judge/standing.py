@@ -1,4 +1,4 @@
-"""What a run has to keep: limits of its figures, standing at its end, soundness all the way."""
+"""Requirements on a run: limits of its figures, standing at its end, soundness throughout."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ LIMITS: Final = (
     VerdictLimit("alive_sole_tilt_max_rad", 0.02, "rad", "soles' tilt, led"),
     VerdictLimit("torque_at_limit_ms", 50.0, "ms", "module's torque at its limit, longest"),
     VerdictLimit("shaking_nm", 15.0, "N m", "torque above 8 Hz, root mean square"),
-    VerdictLimit("sinking_m_s", 0.8, "m/s", "torso's fastest way down"),
+    VerdictLimit("sinking_m_s", 0.8, "m/s", "torso's fastest descent"),
     VerdictLimit("overforce_s", 1.0, "s", "hand's force over 100 N while led, longest"),
     VerdictLimit("operator_peak_n", 40.0, "N", "operator's force, led"),
     VerdictLimit("operator_side_peak_n", 60.0, "N", "operator's force sideways, led"),
-    VerdictLimit("assist_error_n", 10.0, "N", "assist force against what was asked"),
+    VerdictLimit("assist_error_n", 10.0, "N", "assist force against the request"),
     VerdictLimit("hold_com_x_max_mm", 80.0, "mm", "COM x, held"),
     VerdictLimit("hold_com_y_max_mm", 100.0, "mm", "COM y, held"),
     VerdictLimit("handover_max_ms", 65.0, "ms", "kill to HOLD, slowest module"),
@@ -51,39 +51,39 @@ LIMITS: Final = (
     VerdictLimit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
     VerdictLimit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
 )
-"""Live targets. Only `stood` decides the exit code: to the end, standing then
-(`tools.judge.standing`), and soundly all the way (`SOUND`). `led`: all six modules track, before
-any kill; `held`: after a kill, or in HOLD by an impaired network. What a stall of the machine made
-of a run counts as neither (`tools.fleet.stalls`)."""
+"""Live targets. Only `stood` decides the exit code: the run reached its end, the robot stands there
+(`tools.judge.standing`), and it stood soundly throughout (`SOUND`). `led`: all six modules track,
+before any kill; `held`: after a kill, or in HOLD because of an impaired network. The consequences
+of a stall of the machine count as neither (`tools.fleet.stalls`)."""
 
 BY_KEY: Final = {row.key: row for row in LIMITS}
 
 SOUND: Final = ("torque_at_limit_ms", "shaking_nm", "sinking_m_s", "overforce_s")
-"""A run in which one of these is over its limit did not stand. The limit of sinking: a person who
-catches up with a robot that held leads it down at up to 0.73 m/s (`bad_network`)."""
+"""A run in which one of these exceeds its limit did not stand. On the limit of sinking: a person
+who catches up with a robot that held leads it down at up to 0.73 m/s (`bad_network`)."""
 
 
 OVERFORCE_N: Final = 100.0
-"""Force of the hand along z. A led robot yields to 20 N; for longer than a second this much means
-that it follows something else, such as a harness sensor that lies."""
+"""Force of the hand along z. A led robot yields to 20 N; over 100 N for longer than a second means
+that it follows something else, such as a faulty harness sensor."""
 SOLE_TILT_MAX: Final = 0.05
-"""rad; a sole tilted more than this does not lie down again by itself."""
+"""rad; a sole tilted by more than this does not settle on its own."""
 TURNED_MAX: Final = 0.3
-"""rad, roll and yaw of the torso; requests are 0.12 at most."""
+"""rad, roll and yaw of the torso; requests are at most 0.12."""
 PITCH: Final = (-0.5, 1.6)
-"""rad: led are 0 to 1.2, a hand of 60 N m moves a torso that holds by 0.3."""
+"""rad; a led pitch is 0 to 1.2, and a hand with 60 N m moves a holding torso by 0.3."""
 
 
 def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
-    """Return why the robot does not stand at a moment, or is about to fall; "": it stands."""
+    """Return why the robot does not stand or is about to fall, or "" if it stands."""
     if row.fallen:
-        return "it is down"
+        return "it has fallen"
     (x, y), geometry = row.over, robot.geometry
     if abs(x) > geometry.l_foot / 2 or abs(y) > (geometry.w_base + geometry.w_foot) / 2:
         return f"its COM is beyond the soles, at {1e3 * x:.0f}, {1e3 * y:.0f} mm"
     tilt = max(row.foot_right_tilt, row.foot_left_tilt)
     if tilt > SOLE_TILT_MAX:
-        return f"a sole is up, by {tilt:.2f} rad"
+        return f"a sole has lifted, by {tilt:.2f} rad"
     roll, pitch, yaw = row.angles
     if max(abs(roll), abs(yaw)) > TURNED_MAX or not PITCH[0] <= pitch <= PITCH[1]:
         return f"its torso has turned: roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} rad"
@@ -91,9 +91,9 @@ def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
 
 
 BREAK_S: Final = 0.05
-"""Longest gap between states; within a longer one nothing is known."""
+"""Longest gap between states, s; across a longer gap nothing is known."""
 SINK_OVER_S: Final = 0.1
-"""A sole's touch or a blow is faster, and no sinking."""
+"""Time over which sinking is measured, s; a sole's touchdown or a blow is faster."""
 _HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
 
 
@@ -107,7 +107,7 @@ class Soundness(NamedTuple):
 
 
 def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> Soundness:
-    """Return the figures of a run from its first row on."""
+    """Return the figures of a run from its first row onwards."""
     start_ns = truth[0].t_ns
     longest, shaking = [], []
     for module in MODULES:
@@ -157,9 +157,9 @@ def why_not_sound(figures: object) -> str:
 
 
 def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:
-    """Return the root mean square above `SHAKE_ABOVE_HZ` (n, 2), N m, as `services.joint.trips`.
+    """Return the root mean square above `SHAKE_ABOVE_HZ` (n, 2), N m, as in `services.joint.trips`.
 
-    `tau` (n, 2), N m, is that of a module's axes at `t_ns` (n,).
+    `tau` (n, 2), N m, is the torque of a module's axes at `t_ns` (n,).
     """
     slow, mean = tau[0].copy(), np.zeros(2)
     found = np.zeros_like(tau)
@@ -174,7 +174,7 @@ def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:
 
 
 def _longest_s(t_ns: NDArray[np.int64], true: NDArray[np.bool_]) -> float:
-    """Return the longest time without a break, s."""
+    """Return the longest time that is true without a break, s."""
     longest_ns, since_ns, last_ns = 0, -1, 0
     for at_ns, is_true in zip(t_ns.tolist(), true.tolist(), strict=True):
         broken, last_ns = at_ns - last_ns > BREAK_S * NS_PER_S, at_ns
@@ -188,7 +188,7 @@ def _longest_s(t_ns: NDArray[np.int64], true: NDArray[np.bool_]) -> float:
 
 
 def _sinking(truth: Sequence[SimTruth]) -> float | None:
-    """Return the fastest way down of the torso, m/s."""
+    """Return the fastest descent of the torso, m/s."""
     if len(truth) < 2:
         return None
     t = np.array([row.t_ns for row in truth])

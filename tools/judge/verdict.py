@@ -1,6 +1,6 @@
-"""Judges a run by figures from its log alone, beside their limits.
+"""Judges a run by figures from its log alone, and compares them with their limits.
 
-Everything is read from the MCAP file, so that a run can be judged again at any time.
+All figures come from the MCAP file, so a run can be judged again at any time.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from tools.logs.run_log import RunLog, parts_of, robot_of
 KILLED, RESTARTED = RunEventKind.KILLED, RunEventKind.RESTARTED
 REAL_TIME_FACTOR_MIN: Final = 0.99
 NEXT_CYCLE_MS: Final = 2.0
-"""In virtual time a module sees the end of a process on its host in its next cycle, after up to
-this time, ms: nothing is measured."""
+"""In virtual time a module detects the end of a process on its host in its next cycle, after up to
+this time, ms, so such a value is not a measurement."""
 LATE_MAX_S: Final = 0.05
-"""More world time given up than this: the run was not in real time."""
+"""If more world time than this is given up, the run was not in real time, s."""
 
 
 class Percentiles(msgspec.Struct, frozen=True):
@@ -53,10 +53,10 @@ class ShownStall(msgspec.Struct, frozen=True):
     at_s: float
     lasted_ms: float
     apart_until_s: float
-    """The run is judged apart until then."""
+    """End of the time that is judged separately."""
     modules_held: int
     said: str
-    """All of it as a line for people."""
+    """The stall as a line of text."""
 
 
 def _worst(found: Sequence[Percentiles]) -> Percentiles:
@@ -67,7 +67,7 @@ def _worst(found: Sequence[Percentiles]) -> Percentiles:
 
 
 def _each_stall(found: Sequence[list[ShownStall]]) -> list[ShownStall]:
-    """Return the stalls of all parts; the later part knows more of one that is in two."""
+    """Return the stalls of all parts; for a stall in two parts, the later part knows more."""
     return list({row.at_s: row for part in found for row in part}.values())
 
 
@@ -77,19 +77,19 @@ Spread: TypeAlias = Annotated[Percentiles | None, _worst]
 
 
 class Summary(msgspec.Struct, kw_only=True):
-    """Figures of a run, as `summary.json` has them.
+    """Figures of a run, as in `summary.json`.
 
-    The annotation of a field says how the figures of the parts of a long run are merged; a field
-    without one has the value of the last part. A figure is None where the log does not tell it.
+    The annotation of a field says how to merge the figures of the parts of a long run; a field
+    without annotation has the value of the last part. A figure is None if the log does not give it.
     """
 
     stood: bool = False
-    """It stands at the planned end of its scenario."""
+    """True if the robot stands at the planned end of its scenario."""
     sound: bool = False
     why_not: str = ""
-    """Why it does not stand at the end."""
+    """Reason why it does not stand at the end."""
     unsound: str = ""
-    """Limits of soundness that it exceeded."""
+    """Limits of soundness that were exceeded."""
     began: bool = False
     fallen_at_s: Smallest = None
     duration_s: float = 0.0
@@ -104,7 +104,7 @@ class Summary(msgspec.Struct, kw_only=True):
     pitch_max_rad: Largest = None
     yaw_max_rad: Largest = None
     hold_com_x_max_mm: Largest = None
-    """`hold_`: while no planner leads; `alive_`: while it leads, against what the hand asks."""
+    """`hold_`: while no planner leads; `alive_`: while it leads, relative to the hand's request."""
     hold_com_y_max_mm: Largest = None
     hold_roll_max_rad: Largest = None
     hold_pitch_max_rad: Largest = None
@@ -133,39 +133,39 @@ class Summary(msgspec.Struct, kw_only=True):
     reengage_s: Largest = None
     """From the first restart to TRACK of the last module."""
     hold_entries: Annotated[int, max] = 0
-    """Of the module that dropped out most often."""
+    """Dropouts of the module that dropped out most often."""
     command_age_ms: Spread = None
     command_age_impaired_ms: Spread = None
     command_age_otherwise_ms: Spread = None
     links_impaired: int = 0
     impairments: list[str] = []
-    """Where, what, when, messages passed and lost; a line for each."""
+    """One line each: link, impairment, time, messages passed and lost."""
     pd_cycles_late_pct: Largest = None
     planner_tick_us: Spread = None
     stopped: list[str] = []
-    """Processes that were frozen."""
+    """Processes that were suspended."""
     messages_recorded: int = 0
-    """Up to the end of the last part; so are the gaps."""
+    """Up to the end of the last part, as for the gaps."""
     sequence_gaps: int = 0
     stalls: Annotated[list[ShownStall], _each_stall] = []
     wearer: Annotated[WearerFigures | None, merged_figures] = None
-    """What it did for the person; None without a harness."""
+    """Effect on the wearer; None without a harness."""
     fleet_cpu_pct: float | None = None
-    """Of a live run."""
+    """Only for a live run."""
     speed: float | None = None
-    """Of a run in virtual time, as a multiple of real time."""
+    """As a multiple of real time; only for a run in virtual time."""
 
 
 class Course(NamedTuple):
     """The simulated world over a run."""
 
     t: Array
-    """Time of each row, s: scenario time, or since the hoist's release if the scenario never
+    """Time of each row, s: scenario time, or time since the hoist's release if the scenario never
     started.
     """
     rows: list[SimTruth]
     began: bool
-    """False if the robot fell before the scenario could begin."""
+    """False if the robot fell before the scenario could start."""
     zero_ns: int
     """Monotonic time of t = 0."""
 
@@ -182,18 +182,18 @@ def course(log: RunLog) -> Course:
     if not any(row.fallen for row in let_go):
         statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
         why = statuses[-1].why if statuses else ""
-        because = f", for the planner did not lead: {why}" if why else "; nothing to judge"
-        raise RunError(f"{log.path}: the scenario never began in this log{because}")
+        because = f", because the planner did not lead: {why}" if why else "; nothing to judge"
+        raise RunError(f"{log.path}: the scenario never started in this log{because}")
     zero_ns = let_go[0].t_ns
     t = np.array([(row.t_ns - zero_ns) / NS_PER_S for row in let_go])
     return Course(t, let_go, began=False, zero_ns=zero_ns)
 
 
 def summarise(log: RunLog, duration_s: float, counts: dict[str, KeyCount] | None = None) -> Summary:
-    """Return the figures of a run, or of a part of one; what follows a fall does not count.
+    """Return the figures of a run or of a part of it, without the time after a fall.
 
-    `duration_s` is the planned length of its scenario; `counts` are of the messages up to the end
-    of the part; None: the log is the whole run.
+    `duration_s` is the planned length of its scenario. `counts` cover the messages up to the end
+    of the part; None if the log is the whole run.
     """
     t, truth, began, zero_ns = course(log)
     counted = (log.gaps() if counts is None else counts).values()
@@ -241,7 +241,7 @@ def _shown_stall(row: Disturbance, zero_ns: int) -> ShownStall:
 
 
 def summarise_parts(index: RunIndex, duration_s: float) -> Summary:
-    """Return the figures of a run that is read in parts; RunError says why none can be judged."""
+    """Return the figures of a run that is read in parts; RunError if it cannot be judged."""
     found: list[Summary] = []
     counts: dict[str, KeyCount] = {}
     why: RunError | None = None
@@ -249,15 +249,15 @@ def summarise_parts(index: RunIndex, duration_s: float) -> Summary:
         part.count_into(counts)
         try:
             found.append(summarise(part, duration_s, counts))
-        except RunError as error:  # the scenario has not begun in it
+        except RunError as error:  # the scenario has not started in this part
             why = why or error
     if not found:
-        raise why or RunError(f"{index.path}: holds nothing to judge")
+        raise why or RunError(f"{index.path}: contains nothing to judge")
     return merged(found)
 
 
 def merged(parts: Sequence[Summary]) -> Summary:
-    """Return the figures of a run from those of its parts, in their order."""
+    """Return the figures of a run from those of its parts, in order."""
     last = parts[-1]
     if len(parts) == 1:
         return last
@@ -274,12 +274,12 @@ def merged(parts: Sequence[Summary]) -> Summary:
 
 
 def fell(summary: Summary) -> bool:
-    """Return True if the robot of a run is down, or cannot recover."""
+    """Return True if the robot has fallen, or cannot recover."""
     return summary.fallen_at_s is not None or bool(summary.why_not)
 
 
 def exit_code(summary: Summary) -> int:
-    """Return the exit code of a run that was judged: standing, but not soundly, is a fault."""
+    """Return the exit code of a judged run; standing, but not soundly, is a fault."""
     if summary.sound:
         return 0
     return FELL_EXIT_CODE if fell(summary) else FAULT_EXIT_CODE
@@ -292,11 +292,11 @@ def _is_virtual(log: RunLog) -> bool:
 def _add_end(
     summary: Summary, log: RunLog, t: Array, truth: Sequence[SimTruth], duration_s: float
 ) -> None:
-    """Add how the robot stands at the end, and how soundly it stood until then."""
+    """Add whether the robot stands at the end, and how soundly it stood until then."""
     last, end_s = truth[-1], float(t[-1])
     reached = summary.began and end_s >= duration_s - 0.1
     robot = None
-    with contextlib.suppress(RunError, ConfigError):  # none in the log, or of another version
+    with contextlib.suppress(RunError, ConfigError):  # no robot in the log, or another version
         robot = robot_of(log)
     if robot is not None:
         summary.wearer = wearer_figures(log, robot, truth[0].t_ns)
@@ -318,7 +318,7 @@ def _add_real_time(
     zero_ns: int,
     disturbed: Sequence[Disturbance],
 ) -> None:
-    """Add what only a live run has."""
+    """Add the figures that only a live run has."""
     start_ns, last = truth[0].t_ns, truth[-1]
     stalls = stalls_of(log.messages(topics.RUN_EVENT))
     stalled_ms = sum(row.lasted_ms for row in stalls if zero_ns < row.end_ns <= last.t_ns)
@@ -331,7 +331,7 @@ def _add_real_time(
 
 
 def _in_real_time(last: SimTruth, stalled_s: float) -> bool:
-    """Return True if the world kept up with the clock, but for the stalls of the machine."""
+    """Return True if the world kept up with the clock, apart from stalls of the machine."""
     factor = last.real_time_factor
     if stalled_s and last.scenario_s > 0.0:
         wall_s = last.scenario_s / max(factor, 1e-9)
@@ -347,7 +347,7 @@ def _add_motion(
     kills: Sequence[RunEvent],
     disturbed: Sequence[Disturbance],
 ) -> None:
-    """Add extremes of the robot's motion and of the hand's force, all in all, led and held."""
+    """Add extremes of the robot's motion and of the hand's force: overall, led and held."""
     times_ns = np.array([row.t_ns for row in truth])
     apart = inside(disturbed, times_ns)
     led = leading(log, times_ns)
@@ -380,9 +380,9 @@ POSES: Final = (
 
 
 def _requested(log: RunLog, truth: Sequence[SimTruth]) -> Array:
-    """Return the closed directions that the operator requested, at the planner's rate of reference.
+    """Return the operator's requests for the closed directions, with the planner's reference rate.
 
-    (n, 6): COM x, y over the floor along gravity, z, roll, pitch, yaw; zeros where none was
+    (n, 6): COM x, y over the floor along gravity, z, roll, pitch, yaw; zeros where nothing is
     requested.
     """
     found = np.zeros((len(truth), 6))
@@ -393,7 +393,7 @@ def _requested(log: RunLog, truth: Sequence[SimTruth]) -> Array:
     times_ns = [row.t_ns for row in truth]
     for row in ROWS:
         found[:, row] = np.interp(times_ns, t, p_ref[:, row])
-    # on a slope the reference goes with gravity, as `SimTruth.over` does
+    # on a slope the reference is relative to gravity, like `SimTruth.over`
     found[:, :2] -= [(row.lean[0] * row.com[2], row.lean[1] * row.com[2]) for row in truth]
     return found
 
@@ -403,7 +403,7 @@ def _max(values: Array) -> float | None:
 
 
 def _assist_error(truth: Sequence[SimTruth]) -> float | None:
-    """Return the mean error while a load rests steadily on the harness, N."""
+    """Return the mean error while a steady load rests on the harness, N."""
     errors = [
         abs(b.harness_force_z - b.load_n)
         for a, b in zip(truth, truth[100:], strict=False)
@@ -413,10 +413,10 @@ def _assist_error(truth: Sequence[SimTruth]) -> float | None:
 
 
 def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return, for each time, True if the run is judged by the limits of a leading planner.
+    """Return, for each time, True if the limits of a leading planner apply.
 
-    True until the first kill. While the network is impaired on purpose, only while all six modules
-    track: HOLD is expected then. A module that drops out at any other time is judged.
+    They apply until the first kill. While the network is impaired on purpose, they apply only while
+    all six modules track, since HOLD is expected. A dropout at any other time is judged.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row.t_ns for row in events if row.kind == KILLED]
@@ -427,16 +427,16 @@ def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def shown(row: Impaired, zero_ns: int) -> str:
-    """Return an impairment in a line; times in s after a stamp."""
+    """Return an impairment in one line, with times in s after a stamp."""
     return f"{row.title}: {row.when(zero_ns)}; {row.counts()}"
 
 
 def _add_command_ages(
     summary: Summary, log: RunLog, start_ns: int, network: Sequence[Impaired]
 ) -> None:
-    """Add how old the newest command of each module that tracks was, from the start on, ms.
+    """Add the age of the newest command of each tracking module, from the start on, ms.
 
-    All in all, while a link of that module was impaired, and otherwise.
+    There are three distributions: overall, while a link of that module was impaired, and otherwise.
     """
     ages, impaired = [np.zeros(0)], [np.zeros(0, dtype=bool)]
     for module in MODULES:
@@ -458,7 +458,7 @@ def _percentiles(values: Array) -> Percentiles | None:
 
 
 def _holds(log: RunLog, module: str, from_ns: int) -> list[JointEvent]:
-    """Return each time that a module went from TRACK to HOLD."""
+    """Return each change of a module from TRACK to HOLD."""
     events: list[JointEvent] = log.messages(topics.JOINT_EVENT, module)
     return [row for row in events if row.t_ns >= from_ns and goes_to_hold(row)]
 
@@ -466,7 +466,7 @@ def _holds(log: RunLog, module: str, from_ns: int) -> list[JointEvent]:
 def _add_handover(summary: Summary, log: RunLog, kills: Sequence[RunEvent]) -> None:
     """Add the time from the first kill to HOLD, and the largest torque step into HOLD.
 
-    Steps count from the first kill on, or from when the network was first impaired.
+    Steps count from the first kill, or from the first impairment of the network.
     """
     impaired = [row.t_ns for row in log.messages(topics.LINK_EVENT)]
     begins = [row.t_ns for row in kills[:1]] + impaired[:1]
@@ -502,7 +502,7 @@ def _reengage(log: RunLog, events: Sequence[RunEvent]) -> float | None:
 def _late_share(log: RunLog, start_ns: int, disturbed: Sequence[Disturbance]) -> float | None:
     """Return the fraction of late PD cycles outside of stalls, %.
 
-    A service that restarts counts from 0.
+    The counts of a service that restarts begin at 0.
     """
     late = cycles = 0
     for module in MODULES:
@@ -518,13 +518,13 @@ def _late_share(log: RunLog, start_ns: int, disturbed: Sequence[Disturbance]) ->
 
 
 def _pace(log: RunLog) -> float:
-    """Return the pace of the fleet's clock; 1 where the log does not say it."""
+    """Return the pace of the fleet's clock; 1 if the log does not contain it."""
     text = log.metadata.get("run", {}).get("pace", "1")
     try:
         pace = float(text)
     except ValueError:
         pace = math.nan
     if not 0.0 < pace <= 1.0:
-        right = "above 0 and up to 1 is right"
-        raise RunError(f"{log.path}: run.pace is {text[:40]!r}; {right}")
+        right = "must be above 0 and at most 1"
+        raise RunError(f"{log.path}: run.pace is {text[:40]!r}; it {right}")
     return pace

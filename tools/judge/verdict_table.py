@@ -1,4 +1,4 @@
-"""The verdict for people: one table in the terminal."""
+"""The verdict as a table in the terminal."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tools.terminal import Console, marked
 OK: Final = "ok"
 OVER: Final = "over"
 OF_THE_MACHINE: Final = ("pd_cycles_late_pct", "fleet_cpu_pct", "sequence_gaps")
-"""Figures that no impairment of a link explains."""
+"""Figures that an impaired link cannot explain."""
 STALLS_MAX: Final = 6
-"""Lines about single stalls."""
+"""Maximum number of lines about single stalls."""
 NOTHING: Final = 5e-4
-"""Less than this is shown as 0.00: no limit is near it."""
+"""Smaller values are shown as 0.00; no limit is near them."""
 
 
 def show(summary: Summary, console: Console) -> None:
@@ -36,8 +36,8 @@ def show(summary: Summary, console: Console) -> None:
     if summary.sound and any(word.startswith(OVER) for *_, word in figures):
         decide = ", ".join(BY_KEY[key].what for key in SOUND)
         console.print(
-            "A figure over its limit is reported and does not decide: standing to the end does, "
-            f"and {decide}.",
+            "Figures over their limits are only reported. Only these decide the verdict: standing "
+            f"to the end, {decide}.",
             style="dim",
         )
     wearer = [] if summary.wearer is None else [summary.wearer.describe()]
@@ -45,7 +45,7 @@ def show(summary: Summary, console: Console) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if summary.pace != 1.0:
         console.print(
-            f"In slow motion: the fleet's clock went at {summary.pace:g} of real time.",
+            f"In slow motion: the fleet's clock ran at {summary.pace:g} of real time.",
             style="dim",
             highlight=False,
         )
@@ -54,7 +54,7 @@ def show(summary: Summary, console: Console) -> None:
             marked(
                 "[yellow]The machine was too slow for real time: real-time factor "
                 "{:.3f}, {:.2f} s of world "
-                "time given up. The times above are not those of a robot.[/]",
+                "time given up. The times above are not those of a real robot.[/]",
                 summary.real_time_factor,
                 summary.world_time_lost_s,
             )
@@ -65,7 +65,7 @@ def show(summary: Summary, console: Console) -> None:
 def rows(summary: Summary) -> list[tuple[str, str, str, str]]:
     """Return figure, measured, limit and mark of each figure that is known.
 
-    After a kill its time to HOLD has a row in any case: `-` if it was not measured.
+    After a kill there is always a row for its time to HOLD, with `-` if it was not measured.
     """
     found = []
     for row in LIMITS:
@@ -80,7 +80,7 @@ def rows(summary: Summary) -> list[tuple[str, str, str, str]]:
 
 
 def mark(row: VerdictLimit, summary: Summary) -> str:
-    """Return the verdict on a figure: `ok`, or `over` and perhaps why."""
+    """Return the verdict on a figure: `ok`, or `over`, possibly with a reason."""
     if getattr(summary, row.key) <= row.limit:
         return OK
     if row.key == "sequence_gaps" and summary.stopped:
@@ -91,7 +91,7 @@ def mark(row: VerdictLimit, summary: Summary) -> str:
 
 
 def stalls(summary: Summary) -> list[str]:
-    """Return a line for each stall that made modules hold, and one for the others."""
+    """Return a line for each stall that made modules hold, and one line for the other stalls."""
     told = [row.said for row in summary.stalls if row.modules_held]
     rest = [row.lasted_ms for row in summary.stalls if not row.modules_held]
     lines = told[:STALLS_MAX]
@@ -101,14 +101,14 @@ def stalls(summary: Summary) -> list[str]:
         lines.append(f"Stalls of the machine without consequence: {len(rest)}, at most "
                      f"{max(rest):.0f} ms")  # fmt: skip
     if told:
-        lines.append("Figures marked led or held leave out what a stall made of the run.")
+        lines.append("Figures marked led or held exclude the consequences of stalls.")
     return lines
 
 
 def network(summary: Summary) -> list[str]:
-    """Return a line for each impairment: where, what, when, messages passed and lost.
+    """Return a line for each impairment: link, impairment, time, messages passed and lost.
 
-    If there is any, one more line compares the commands' ages during impairments and outside.
+    If there is any, one more line compares the command ages during impairments and outside.
     """
     lines = list(summary.impairments)
     ages = [
@@ -127,7 +127,7 @@ def network(summary: Summary) -> list[str]:
 def digits(value: float) -> str:
     """Return a figure with three digits, or all before the point: 1540, not 1.54e+03.
 
-    Next to nothing is 0.00; none is 0.
+    A nonzero value below `NOTHING` is 0.00; zero is 0.
     """
     if abs(value) < NOTHING:
         return "0.00" if value else "0"
@@ -139,7 +139,7 @@ def _sentence(summary: Summary) -> Text:
         return marked("[bold green]STOOD[/] for {:.1f} s", summary.duration_s)
     if not summary.began:
         return marked(
-            "[bold red]FELL[/] {:.1f} s after the hoist let go, before the scenario began",
+            "[bold red]FELL[/] {:.1f} s after the hoist released it, before the scenario started",
             summary.fallen_at_s,
         )
     if summary.fallen_at_s is not None:

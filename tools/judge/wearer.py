@@ -1,21 +1,21 @@
-"""What a robot did for the person who wears it, from any log that has harness, planner and joints.
+"""Effect of a robot on its wearer, from any log that has harness, planner and joints.
 
-Definitions (docs/law.md#wearer), with f the upward force and m the moment about pitch of the person
-on the robot at the harness, M the payload with the load that the planner found beyond it, A the
-assist that is requested, v and omega the rates of the harness point and of the torso's pitch:
+Definitions (docs/law.md#wearer): f is the upward force and m the moment about pitch of the person
+on the robot at the harness. M is the payload with the extra load that the planner found, A the
+requested assist. v and omega are the rates of the harness point and of the torso's pitch:
 
-    carried = M g - f          what the robot bears of payload and person, N
+    carried = M g - f          weight of payload and person that the robot carries, N
     asked   = M g + A
     share   = mean(carried) / mean(asked)
     work    = integral of max(0, f v + m omega)      by the person, J
     bump    = |f - f, low-passed by `SLOW_S`| > `BUMP_N` for less than `BUMP_S`
     resting : -f > `RESTS_N` while the robot is still
 
-Forces are those of a hand too: while it leads, the person's push up or down is missing or added.
+The forces include those of the hand: while it leads, the person's push up or down is part of them.
 
-`thresholds_of` measures what park must know of a person (docs/law.md#park), from a log in which
-they stood, squatted and rested: how hard they pull when they lead up, and when they do not mean
-to, and how long they pause at the turn of a squat.
+`thresholds_of` measures what park must know about a person (docs/law.md#park), from a log in which
+they stood, squatted and rested. It measures how hard they pull when they lead up, how hard they
+pull unintentionally, and how long they pause at the turn of a squat.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ from tools.logs.run_log import RunLog
 
 SLOW_S: Final = 0.3
 BUMP_N: Final = 22.0
-"""N; a led squat peaks there."""
+"""N; a led squat has peaks of this size."""
 BUMP_S: Final = 0.05
 RESTS_N: Final = 20.0
 SQUATS_MIN: Final = 2
 WORK_MIN_S: Final = 5.0
 IDLE_MARGIN: Final = 1.25
-"""Of the largest pull of a person who does not mean to lead."""
+"""Factor on the largest pull of a person who does not intend to lead."""
 PAUSE_MARGIN: Final = 1.25
 PAUSE_MAX_S: Final = 2.0
 STILL_MIN_S: Final = 0.5
 LEADS_FROM_S: Final = 0.4
-"""A person pulls before the robot moves, and after; neither is a rest."""
+"""A person pulls before and after the robot moves; neither time counts as rest, s."""
 GRID_S: Final = 0.04
-"""Rates are differences over this time."""
+"""Rates are differences over this time, s."""
 PHASES: Final = ("stand", "down", "work", "up")
 
 
 class _Phase(msgspec.Struct, frozen=True):
-    """Means over the time that a robot spent in a phase."""
+    """Means over the time that the robot spent in a phase."""
 
     seconds: float
     carried_n: float
@@ -70,39 +70,39 @@ class _Phase(msgspec.Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Part of payload and assist that the robot carried."""
+        """Fraction of payload and assist that the robot carried."""
         return self.carried_n / self.asked_n if self.asked_n else 0.0
 
 
 class WearerFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """Figures of a run, or of a part."""
+    """Figures of a run, or of a part of it."""
 
     phases: dict[str, _Phase]
-    """By `PHASES`, and `all`; those that did not occur are left out."""
+    """By `PHASES`, and `all`, without those that did not occur."""
     work_j: float
     force_rms_n: float
-    """Of the force on the person in all directions."""
+    """Root mean square of the force on the person, all directions."""
     force_peak_n: float
     bumps: int
     bump_peak_n: float
     resting_s: float
 
     def describe(self) -> str:
-        """Return them in a line."""
+        """Return the figures in one line."""
         whole = self.phases["all"]
         each = ", ".join(
             f"{name} {100 * row.share:.0f} %" for name, row in self.phases.items() if name != "all"
         )
         bumps = f"{self.bumps} bumps of {self.bump_peak_n:.0f} N" if self.bumps else "no bumps"
         return (
-            f"The wearer: it carried {100 * whole.share:.0f} % of {whole.asked_n:.0f} N ({each}); "
-            f"force {self.force_rms_n:.1f} N rms, {self.force_peak_n:.0f} N at most, "
+            f"The wearer: the robot carried {100 * whole.share:.0f} % of {whole.asked_n:.0f} N "
+            f"({each}); force {self.force_rms_n:.1f} N rms, at most {self.force_peak_n:.0f} N, "
             f"{self.work_j:.1f} J of work, {bumps}, {self.resting_s:.1f} s of rest"
         )
 
 
 class _Motion(NamedTuple):
-    """How the robot moved, by the ticks of the planner, `GRID_S` apart."""
+    """The robot's motion by planner ticks, `GRID_S` apart."""
 
     t_ns: NDArray[np.int64]
     phase: NDArray[np.intp]
@@ -117,11 +117,11 @@ class _Motion(NamedTuple):
     assist: Array
     """A, N."""
     led: NDArray[np.bool_]
-    """The planner leads, and the robot is not parked."""
+    """True while the planner leads and the robot is not parked."""
 
 
 class _Felt(NamedTuple):
-    """What the harness measured, by its own samples."""
+    """Measurements of the harness, by its own samples."""
 
     t: Array
     """s"""
@@ -132,32 +132,32 @@ class _Felt(NamedTuple):
     moment: Array
     """About pitch, N m."""
     at: NDArray[np.intp]
-    """Index of the motion then."""
+    """Index of the motion at each sample."""
 
 
 class _MeasuredThresholds(NamedTuple):
-    """What park must know of a person, and how it was found."""
+    """Thresholds that park needs of a person, and how they were found."""
 
     thresholds: WearerThresholds
     squats: int
     why: tuple[str, ...]
-    """Each threshold, with what it follows from."""
+    """Each threshold with its derivation."""
     doubts: tuple[str, ...]
 
 
 def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
-    """Return a person's thresholds of park, in the ranges of the robot file.
+    """Return a person's thresholds of park, within the ranges of the robot file.
 
     Args:
         log: a person stood, squatted at least twice, and rested in a crouch, led by the planner.
-        robot: the robot of the log; its own threshold stays where the log shows nothing.
+        robot: the robot of the log; its own threshold remains if the log contains no evidence.
 
     Raises:
-        RunError: the log does not show that.
+        RunError: the log does not contain that motion.
     """
     motion, felt = _read(log, robot)
     if motion is None or felt is None:
-        raise RunError(f"{log.path}: no harness, planner and joints in it, or it was never led")
+        raise RunError(f"{log.path}: has no harness, planner and joints, or was never led")
     led, phase = motion.led, motion.phase
     still = led & motion.still
     rests = _eroded(still, round(LEADS_FROM_S / GRID_S))
@@ -165,9 +165,9 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
     pauses = _pauses(np.where(led, phase, -1), motion.t_ns / NS_PER_S)
     if len(pauses) < SQUATS_MIN or work_s < WORK_MIN_S:
         raise RunError(
-            f"{log.path}: {len(pauses)} squats and {work_s:.0f} s still in a crouch, led; needed "
-            f"are {SQUATS_MIN} and {WORK_MIN_S:.0f} s: stand, squat down and up three times "
-            "without a stop, and rest in a crouch, with park off"
+            f"{log.path}: while led, it holds {len(pauses)} squats and {work_s:.0f} s at rest in a "
+            f"crouch; {SQUATS_MIN} and {WORK_MIN_S:.0f} s are needed. Record again with park off: "
+            "stand, squat three times without stopping, then rest in a crouch"
         )
     up, idle = (led & (phase == PHASES.index("up")))[felt.at], rests[felt.at]
     park, doubts = robot.park, []
@@ -175,8 +175,8 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
     open_n = max(leads_n, IDLE_MARGIN * rests_n)
     if rests_n * IDLE_MARGIN > leads_n:
         doubts.append(
-            f"at rest this person pulls by up to {rests_n:.0f} N, leading up by {leads_n:.0f} N: "
-            f"a parked robot would open by itself below {open_n:.0f} N"
+            f"this person pulls with up to {rests_n:.0f} N at rest, but leads up with "
+            f"{leads_n:.0f} N: a parked robot would open on its own below {open_n:.0f} N"
         )
     why = [f"open_n: led up with {leads_n:.1f} N, at rest at most {rests_n:.1f} N"]
     open_back_nm = park.open_back_nm
@@ -198,20 +198,20 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
 
 
 def _eroded(inside: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Return what is inside and as many samples away from all that is not."""
+    """Return the samples that are inside, and at least `by` samples away from any that is not."""
     padded = np.pad(inside, by, constant_values=True)
     return np.asarray(sliding_window_view(padded, 2 * by + 1).all(axis=1))
 
 
 def _in_range(key: str, value: float) -> float:
-    """Return a threshold rounded, and inside its range of the robot file."""
+    """Return a rounded threshold, within its range of the robot file."""
     hint = get_type_hints(WearerThresholds, include_extras=True)[key]
     low, high, _ = hint.__metadata__[0]
     return float(round(min(high, max(low, value)), 2))
 
 
 def _lasting(values: Array, inside: NDArray[np.bool_], t: Array) -> float:
-    """Return the largest value that lasts as long as what opens park; at least 0."""
+    """Return the largest value that lasts as long as an input that opens park; at least 0."""
     width = max(1, round(LASTS_NS / NS_PER_S / float(np.median(np.diff(t)))))
     kept = np.where(inside, values, 0.0)
     if len(kept) < width:
@@ -220,9 +220,9 @@ def _lasting(values: Array, inside: NDArray[np.bool_], t: Array) -> float:
 
 
 def _pauses(phase: NDArray[np.intp], t: Array) -> list[float]:
-    """Return how long each way down was followed by a still crouch before the way up, s.
+    """Return the duration of the still crouch between each way down and the way up, s.
 
-    A longer stay than `PAUSE_MAX_S` is no turn.
+    A longer stay than `PAUSE_MAX_S` does not count as a turn.
     """
     down, work, rise = (PHASES.index(name) for name in ("down", "work", "up"))
     bounds = np.flatnonzero(np.diff(phase, prepend=-2))
@@ -241,9 +241,9 @@ def wearer_figures(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> WearerF
     """Return the figures from a time on, or from when the planner first led; None without data.
 
     Args:
-        log: the run, or a part of one.
+        log: the run, or a part of it.
         robot: the robot of the log.
-        from_ns: monotonic time; 0: when the planner first leads in it.
+        from_ns: monotonic time; 0 for the first time that the planner leads in it.
     """
     motion, felt = _read(log, robot, from_ns)
     if motion is None or felt is None:
@@ -266,7 +266,7 @@ def wearer_figures(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> WearerF
 
 
 def _read(log: RunLog, robot: RobotConfig, from_ns: int = 0) -> tuple[_Motion | None, _Felt | None]:
-    """Return how the robot moved and what its harness felt; None where the log has nothing."""
+    """Return the robot's motion and the harness data; None where the log has no data."""
     statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
     leads = (row.t_ns for row in statuses if row.mode == PlannerMode.LEADING)
     from_ns = from_ns or next(leads, 1 << 62)

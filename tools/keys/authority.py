@@ -1,7 +1,7 @@
-"""The folder of a robot's authority, and the bundles that hosts get of it.
+"""Folder of a robot's authority, and the bundles that it makes for hosts.
 
-It signs certificates, and never leaves its machine. A host's bundle has certificates and keys of
-what the host runs, and never the authority's key.
+The authority signs certificates, and never leaves its machine. A host's bundle has certificates and
+keys of what the host runs, and never the authority's key.
 
 authority.key, authority.pem    the authority
 names.toml                      the current generation of each name
@@ -33,7 +33,7 @@ _KEY: Final = "authority.key"
 
 
 def default_folder(robot: RobotConfig) -> Path:
-    """Return where a robot's authority lies unless a command says otherwise."""
+    """Return the default folder of a robot's authority."""
     return in_home("~/.config/xrl") / robot.name / "authority"
 
 
@@ -45,7 +45,7 @@ class Authority:
         self.names = credentials.read_names(folder)
         key = folder / _KEY
         if not key.is_file():
-            raise BusError(f"{key}: missing: this folder cannot sign; give its --authority")
+            raise BusError(f"{key}: missing, so this folder cannot sign; give --authority")
         credentials.check_private(key)
         self._issued = Issued((folder / credentials.AUTHORITY).read_bytes(), key.read_bytes())
 
@@ -55,15 +55,15 @@ class Authority:
         return self._issued.certificate
 
     def renew(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Make new certificates and keys in the current generation; the old ones stay valid."""
+        """Issue new certificates and keys in the current generation; the old ones stay valid."""
         self._issue(robot, {name: self.names.generations.get(name, 1) for name in names}, days)
 
     def revoke(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Go on to the next generation; once all hosts know of it the old one is let in nowhere."""
+        """Issue the next generation; once all hosts know of it, none accepts the old one."""
         self._issue(robot, {n: self.names.generations.get(n, 0) + 1 for n in names}, days)
 
     def _issue(self, robot: RobotConfig, generations: Mapping[str, int], days: int) -> None:
-        """Issue all, then write all, and last who is let in."""
+        """Issue all certificates, then write them, and last the generations that are accepted."""
         now = dt.datetime.now(dt.UTC)
         issued = {
             name: certificates.issue(
@@ -79,10 +79,10 @@ class Authority:
 
 
 def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
-    """Make a robot's authority and a certificate for each name."""
+    """Create a robot's authority and a certificate for each name."""
     if (folder / _KEY).exists():
-        right = "`xrl keys renew` makes new certificates, `xrl keys revoke` shuts old ones out"
-        raise BusError(f"{folder}: holds an authority already; {right}")
+        right = "`xrl keys renew` makes new certificates, `xrl keys revoke` revokes old ones"
+        raise BusError(f"{folder}: has an authority already; {right}")
     names = Names(robot.name, dict.fromkeys(principals_of(robot), 1))
     for name in names.generations:
         hosts_of(robot, name)  # before anything is written
@@ -90,7 +90,7 @@ def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)
     except OSError as error:
-        raise BusError(f"{folder}: cannot be made: {error.strerror}") from None
+        raise BusError(f"{folder}: cannot be created: {error.strerror}") from None
     own = certificates.make_authority(robot.name, dt.datetime.now(dt.UTC))
     replace_file(folder / credentials.AUTHORITY, own.certificate, private=True)
     replace_file(folder / credentials.NAMES, credentials.to_toml(names), private=True)
@@ -106,15 +106,15 @@ def principals_of(robot: RobotConfig) -> tuple[str, ...]:
 
 
 def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
-    """Return what a service is dialled by: the host of its endpoint. Tools listen nowhere."""
+    """Return the host by which a service is dialled; empty for tools, which listen nowhere."""
     if name not in SERVICES:
         return ()
     endpoint = robot.bus.endpoints[name]
     found = re.fullmatch(r"tls/\[?([^\]]+?)\]?:\d+", endpoint)
     if found is None:
         raise BusError(
-            f"bus.endpoints.{name}: {endpoint!r} has no certificate; tls/HOST:PORT is "
-            "right, or --hosts FILE for a robot on several hosts"
+            f"bus.endpoints.{name}: {endpoint!r} has no certificate; must be tls/HOST:PORT, "
+            "or give --hosts FILE for a robot on several hosts"
         )
     return (found[1],)
 
@@ -128,18 +128,18 @@ def bundle(authority: Authority, names: Iterable[str]) -> dict[str, bytes]:
     }
     for name in names:
         if name not in authority.names.generations:
-            right = f"one of {', '.join(authority.names.generations)}"
+            right = f"use one of {', '.join(authority.names.generations)}"
             raise BusError(f"{name!r} has no certificate here; {right}")
         for file in (certificate_file(folder, name), key_file(folder, name)):
             try:
                 files[file.name] = file.read_bytes()
             except OSError as error:
-                raise BusError(f"{file}: {error.strerror}; `xrl keys renew {name}`") from None
+                raise BusError(f"{file}: {error.strerror}; run `xrl keys renew {name}`") from None
     return files
 
 
 def to_tar(files: dict[str, bytes]) -> bytes:
-    """Return a tar file that unpacks into one folder, each file its owner's alone."""
+    """Return a tar file that unpacks into one folder; only its owner can read the files."""
     written = io.BytesIO()
     with tarfile.open(fileobj=written, mode="w") as tar:
         for name, content in files.items():
@@ -155,7 +155,7 @@ def held_files(folder: Path) -> list[str]:
 
 
 def install(files: dict[str, bytes], folder: Path) -> None:
-    """Write a bundle into this host's folder of keys, and take away keys that are not in it."""
+    """Write a bundle into this host's folder of keys, and delete keys that are not in it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)

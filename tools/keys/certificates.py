@@ -1,4 +1,4 @@
-"""X.509 certificates on P-256, as rustls, Zenoh's TLS, takes them."""
+"""X.509 certificates on P-256, for rustls, which is Zenoh's TLS."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 AUTHORITY_DAYS: Final = 3650
 CERTIFICATE_DAYS: Final = 730
 _EARLIER: Final = dt.timedelta(days=1)
-"""A certificate counts from a day before it was made: hosts' clocks differ."""
+"""A certificate is valid from a day before it was made, because hosts' clocks differ."""
 
 
 class Issued(NamedTuple):
@@ -27,7 +27,7 @@ class Issued(NamedTuple):
 
 
 class Details(NamedTuple):
-    """What a certificate says."""
+    """Contents of a certificate."""
 
     common_name: str
     begins: dt.datetime
@@ -62,12 +62,12 @@ def issue(
 ) -> Issued:
     """Return a new certificate for both sides of a link.
 
-    The access rules go by its common name (`shared.bus.security.common_name`); who dials checks the
-    names and addresses of `hosts`.
+    The access rules use its common name (`shared.bus.security.common_name`). The dialling side
+    checks the names and addresses in `hosts`.
     """
     signer = serialization.load_pem_private_key(authority.key, password=None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey):
-        raise TypeError("the authority's key is none of P-256")
+        raise TypeError("the authority's key is not on P-256")
     parent = x509.load_pem_x509_certificate(authority.certificate)
     key = ec.generate_private_key(ec.SECP256R1())
     usages = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -83,7 +83,7 @@ def issue(
 
 
 def read(certificate: bytes) -> Details:
-    """Return what a certificate says."""
+    """Return the contents of a certificate."""
     found = x509.load_pem_x509_certificate(certificate)
     (name,) = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     hosts: list[str] = []

@@ -1,4 +1,4 @@
-"""Are a host's keys right? For `xrl keys check` and `xrl doctor`."""
+"""Check of a host's keys, for `xrl keys check` and `xrl doctor`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tools.keys.certificates import Details
 _DAY: Final = "%Y-%m-%d"
 _TIME: Final = "%Y-%m-%d %H:%M UTC"
 WARN_DAYS: Final = 60
-"""An expiry within so many days is a warning."""
+"""Days before its expiry from which a certificate causes a warning."""
 
 
 class KeyRow(NamedTuple):
-    """What there is to say about one certificate."""
+    """Result of the check of one certificate."""
 
     name: str
     begins: str
@@ -37,30 +37,30 @@ def inspect_keys(folder: Path, robot: RobotConfig) -> list[KeyRow]:
     """Return a row for each certificate in a folder, the authority's own first."""
     names = credentials.read_names(folder)
     if names.robot != robot.name:
-        right = f"those of {robot.name!r} are right"
+        right = f"must be those of {robot.name!r}"
         raise BusError(f"{folder}: keys of robot {names.robot!r}; {right}")
     try:
         authority = (folder / credentials.AUTHORITY).read_bytes()
         signer = certificates.read(authority)
     except (OSError, ValueError) as error:
-        raise BusError(f"{folder / credentials.AUTHORITY}: no certificate: {error}") from None
+        raise BusError(f"{folder / credentials.AUTHORITY}: not a certificate: {error}") from None
     held = [name for name in names.generations if key_file(folder, name).exists()]
     if not held:
-        raise BusError(f"{folder}: holds no certificate of a process; `xrl keys pack` makes some")
-    own = _row(signer, *_validity(signer, "a new authority: `xrl keys make --authority DIR`"))
+        raise BusError(f"{folder}: has no certificate of a process; run `xrl keys pack`")
+    own = _row(signer, *_validity(signer, "make a new authority: `xrl keys make --authority DIR`"))
     return [own, *(_inspect(folder, robot, names, name, authority) for name in held)]
 
 
 def _validity(found: Details, renewal: str) -> tuple[str, str]:
-    """Return what is wrong with a certificate's time by this host's clock, and a warning."""
+    """Return the error of a certificate's validity by this host's clock, and a warning."""
     now = dt.datetime.now(dt.UTC)
     left = found.expires - now
     if now < found.begins:
-        wrong = f"not valid before {found.begins:{_TIME}}, and this host's clock says {now:{_TIME}}"
-        return f"{wrong}: no new link; set the clock", ""
+        wrong = f"not valid before {found.begins:{_TIME}}, but this host's clock says {now:{_TIME}}"
+        return f"{wrong}: no new link is possible; set the clock", ""
     if left < dt.timedelta():
-        wrong = f"expired at {found.expires:{_TIME}}, and this host's clock says {now:{_TIME}}"
-        return f"{wrong}: no new link; {renewal}", ""
+        wrong = f"expired at {found.expires:{_TIME}}, but this host's clock says {now:{_TIME}}"
+        return f"{wrong}: no new link is possible; {renewal}", ""
     if left < dt.timedelta(days=WARN_DAYS):
         return "", f"expires in {left.days} days; {renewal}"
     return "", ""
@@ -85,14 +85,14 @@ def _inspect(folder: Path, robot: RobotConfig, names: Names, name: str, authorit
     except (OSError, ValueError, BusError) as error:
         return KeyRow(name, "-", "-", (), str(error))
     current = common_name(name, names.generations[name])
-    wrong, warning = _validity(found, f"`xrl keys renew {name}`, then pack")
+    wrong, warning = _validity(found, f"run `xrl keys renew {name}`, then pack")
     wanted = hosts_of(robot, name)
     if not certificates.is_signed_by(certificate, authority):
         wrong = "signed by another authority; run `xrl keys pack` again"
     elif not certificates.is_key_of(key_file(folder, name).read_bytes(), certificate):
-        wrong = "its key is another's; run `xrl keys pack` again"
+        wrong = "its key is that of another certificate; run `xrl keys pack` again"
     elif found.common_name != current:
-        wrong = f"{found.common_name}, and {current} is let in; run `xrl keys pack` again"
+        wrong = f"{found.common_name}, but only {current} is accepted; run `xrl keys pack` again"
     elif not wrong and name in SERVICES and not set(wanted) <= set(found.hosts):
-        wrong = f"not for {wanted[0]}, where the robot file has it; `xrl keys renew {name}`"
+        wrong = f"not for {wanted[0]}, its host in the robot file; run `xrl keys renew {name}`"
     return _row(found, wrong, warning)

@@ -1,1 +1,1 @@
-"""The laboratory, for researchers: gain design, studies, benches, learning. No robot needs it."""
+"""Laboratory for researchers: gain design, studies, benches, learning. A robot does not need it."""

@@ -1,1 +1,1 @@
-"""The experiment on a fleet of processes: started, watched, impaired."""
+"""The experiment on a live fleet of processes: start it, watch it, impair it."""

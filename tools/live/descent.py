@@ -1,11 +1,11 @@
-"""The robot's way down, and the wait for its weight to be taken, before its drives go limp.
+"""The robot's way down, and the wait until its weight is taken, before its drives go limp.
 
-The robot stands on feet under shins of a metre. Idled in its lowest pose it tips over as it does
-from a stand: the torso meets the floor at 2.8 to 3.1 m/s either way. So going down ends with a
-robot that still holds, and the drives idle once something else bears it: a hoist, or a stand.
+The robot's feet are under shins of a metre. If it is idled in its lowest pose, it tips over as it
+does from a stand: the torso hits the floor at 2.8 to 3.1 m/s either way. So the descent ends with
+a robot that still holds, and the drives idle only after a hoist or a stand carries it.
 
-`Descent` is the law of it, without bus or clock. Does the robot bear weight? The joints' torques
-tell; what is not known counts as weight.
+`Descent` is its law, without bus or clock. The joints' torques show whether the robot carries
+weight; an unknown load counts as weight.
 """
 
 from __future__ import annotations
@@ -42,74 +42,74 @@ from shared.joints import MODULE_INDEX, MODULES, SIDES
 from shared.places import user_name
 
 WAYS: Final = (
-    "hang the robot, or put a stand under its torso, and `xrl down` again; or, to let it drop, "
-    "`xrl down --limp`"
+    "hang the robot, or put a stand under its torso, and run `xrl down` again; or run "
+    "`xrl down --limp` to let it drop"
 )
 LIGHT_FRACTION: Final = 0.25
-"""Fraction of the torso's weight by the file; with less on its legs the robot hangs. Without its
-payload half of it is left."""
+"""Fraction of the torso's weight in the robot file; with less on its legs the robot hangs. Without
+its payload, half of the weight is left."""
 LIGHT_S: Final = 1.0
-"""Time for which it must be so: a robot that bounces is light for a moment."""
+"""Time for which the legs must be that light, s: a bouncing robot is light for a moment."""
 HEARD_S: Final = 3.0
-"""Longest wait for the first states of all six modules, s."""
+"""Timeout for the first states of all six modules, s."""
 PATIENCE_S: Final = 8.0
-"""Longest wait for a planner that may lead again, s."""
+"""Timeout for a planner that may lead again, s."""
 STALLED_S: Final = 4.0
 STALLED_M: Final = 0.005
-"""Sunk by less than this in that time, something holds the robot up."""
+"""If the robot sinks by less than this in that time, something holds it up."""
 SETTLE_S: Final = 40.0
-"""Longest time for DAMP to come to rest, s."""
+"""Timeout for DAMP to come to rest, s."""
 REST_S: Final = 1.0
 REST_RAD: Final = 0.01
-"""A knee that moves less than this in that time is at rest; rates are too noisy to tell."""
+"""A knee that moves less than this in that time is at rest; rates are too noisy to decide."""
 STRAIGHT: Final = -1.0
-"""rad of a knee; above it, a leg whose load is unknown is straight, not folded."""
+"""Knee angle, rad; above it a leg with unknown load is straight, not folded."""
 PULLED: Final = 3.0
-"""N m; a straight leg's torques do not show what it bears. Weight presses a knee back, so one that
-its own shin pulls against the stop harder than friction can bears nothing."""
+"""N m; a straight leg's torques do not show its load. Weight presses a knee back, so a knee carries
+nothing if its own shin pulls it against the stop more strongly than friction can."""
 KNEE_CLOSE: Final = 0.08
-"""rad above the stop at which a knee is down: play and friction keep it there."""
+"""Distance from the stop within which a knee is down, rad: play and friction keep it there."""
 _KNEES: Final = tuple(MODULE_INDEX[f"knee_{side}"] for side in SIDES)
 _NO_TORQUE: Final = (DriveStatus.IDLE, DriveStatus.ERROR, DriveStatus.UNZEROED)
 _MAY_LEAD: Final = (
     PlannerMode.LEADING, PlannerMode.ALIGNING, PlannerMode.TRIPPED, PlannerMode.OVERLOADED,
 )  # fmt: skip
-"""Modes of a planner that leads, or will once it is calm."""
+"""Modes of a planner that leads, or will lead when the motion is calm."""
 
 
 class Ask(Enum):
-    """What the robot is asked for after a look."""
+    """Request to the robot after a step."""
 
     NOTHING = 0
     SIT = 1
-    """The planner: go down."""
+    """The planner must lower the robot."""
     STOP = 2
-    """The modules: DAMP."""
+    """The modules must enter DAMP."""
     IDLE = 3
-    """Nothing bears weight: the drives may go limp."""
+    """The legs carry no weight: the drives may go limp."""
 
 
 class DescentPhase(Enum):
-    """How far it is."""
+    """Progress of the descent."""
 
-    LOOKING = "looking whether it bears weight"
+    LOOKING = "checking whether it carries weight"
     LOWERING = "going down, led by the planner"
     SETTLING = "sinking in DAMP"
-    RESTING = "holds at its lowest pose"
+    RESTING = "holding at its lowest pose"
 
 
 class _LegLoad:
-    """How much of the torso's weight the legs bear, by the joints' torques."""
+    """Fraction of the torso's weight on the legs, from the joints' torques."""
 
     def __init__(self, robot: RobotConfig) -> None:
-        """Take masses and geometry."""
+        """Use the robot's masses and geometry."""
         self._measured = Measured(robot)
         self._weight = GRAVITY * robot.torso_mass
         self.com_height = math.nan
-        """Height of the COM at the last look, m above the ankles."""
+        """Height of the COM at the last call, m above the ankles."""
 
     def fraction(self, states: Sequence[JointState | None]) -> float:
-        """Return the legs' upward force over the torso's weight; NaN if it is not known."""
+        """Return the legs' upward force over the torso's weight; NaN if unknown."""
         known = [state for state in states if state is not None]
         if len(known) < len(MODULES):
             return math.nan
@@ -122,7 +122,7 @@ class _LegLoad:
         if all(_has_no_torque(state) for state in known):
             return 0.0
         if any(state.mode not in (Mode.HOLD, Mode.TRACK, Mode.DAMP) for state in known):
-            return math.nan  # limp, lost, or held by a drive that nobody asks
+            return math.nan  # limp, lost, or held by a drive without a service
         loads = [
             0.0 if math.isnan(load) and knee.q[1] > STRAIGHT and knee.tau[1] < -PULLED else load
             for load, knee in zip(
@@ -137,10 +137,10 @@ def _has_no_torque(state: JointState) -> bool:
 
 
 class Descent:
-    """Decides at each look what to ask for."""
+    """Decides at each step what to request."""
 
     def __init__(self, robot: RobotConfig, wait_s: float) -> None:
-        """Begin with a look; at rest wait `wait_s` for the weight to be taken."""
+        """Begin by checking the load; at rest wait `wait_s` until the weight is taken."""
         self._load, self._wait_s = _LegLoad(robot), wait_s
         self._stop = robot.joint_service.damp_knee_stop
         self._fade_s = robot.joint_service.damp_fade_s
@@ -155,7 +155,7 @@ class Descent:
 
     @property
     def words(self) -> str:
-        """The present state as a line."""
+        """The present state in one line."""
         at = f"COM {self._load.com_height:.2f} m above the ankles, knees at {self._knee:.2f} rad"
         return f"{self.phase.value}: {at}, {self._bears}"
 
@@ -163,15 +163,15 @@ class Descent:
     def _bears(self) -> str:
         if math.isnan(self._fraction):
             return "weight unknown"
-        return f"the legs bear {100.0 * self._fraction:.0f} % of the torso"
+        return f"the legs carry {100.0 * self._fraction:.0f} % of the torso"
 
     def step(
         self, now_s: float, states: Sequence[JointState | None], status: PlannerStatus | None
     ) -> Ask:
-        """Look once, by any clock; None: not heard just now.
+        """Run one step, with any clock; a state or status is None if it is stale.
 
         Raises:
-            FleetError: it cannot go on; the robot is left as it stands.
+            FleetError: the descent cannot continue; the robot is left as it stands.
         """
         if self._since_s is None:
             self._since_s = now_s
@@ -207,7 +207,7 @@ class Descent:
         silent = [name for name, state in zip(MODULES, states, strict=True) if state is None]
         if silent:
             if self._for_s(now_s) > HEARD_S:
-                raise FleetError(f"{', '.join(silent)}: not heard, so it may bear weight: {WAYS}")
+                raise FleetError(f"{', '.join(silent)}: silent, so it may carry weight: {WAYS}")
             return Ask.NOTHING
         if self._for_s(now_s) < LIGHT_S or self._light_s is not None:
             return Ask.NOTHING
@@ -218,8 +218,8 @@ class Descent:
         ]
         if limp:
             raise FleetError(
-                f"{', '.join(limp)}: it may bear weight on the others, and going down would tip "
-                f"it: {WAYS}"
+                f"{', '.join(limp)}: the others may carry weight, and going down would tip "
+                f"the robot: {WAYS}"
             )
         damped = all(state is not None and state.mode == Mode.DAMP for state in states)
         may_lead = status is not None and status.mode in _MAY_LEAD
@@ -239,8 +239,8 @@ class Descent:
                 return Ask.STOP
             why = status.why or name_of(PlannerMode, status.mode)
             raise FleetError(
-                f"the planner does not lead ({why}), so it stands where it is; `xrl estop` lets "
-                f"it sink without a planner; or {WAYS}"
+                f"the planner does not lead ({why}), so the robot stands where it is; `xrl estop` "
+                f"lets it sink without a planner; or {WAYS}"
             )
         if len(known) < len(MODULES):
             return Ask.SIT
@@ -253,7 +253,7 @@ class Descent:
         if now_s - self._moved_s > STALLED_S:
             raise FleetError(
                 f"it is held up at a COM of {height:.2f} m, so it stands where it is: take the "
-                "hand off and `xrl down` again; where a stand bears it, `xrl estop` lets it settle"
+                "hand off and run `xrl down` again; if a stand carries it, run `xrl estop`"
             )
         return Ask.SIT
 
@@ -261,7 +261,7 @@ class Descent:
         if any(state.mode not in (Mode.DAMP, Mode.FAULT) for state in known):
             self._moved_s = now_s
             if self._for_s(now_s) > HEARD_S:
-                raise FleetError(f"not all modules go to DAMP: see `xrl status`; {WAYS}")
+                raise FleetError(f"not all modules go to DAMP: run `xrl status`; {WAYS}")
             return Ask.STOP
         if len(known) < len(MODULES) or abs(self._knee - self._rested) > REST_RAD:
             self._moved_s, self._rested = now_s, self._knee
@@ -274,16 +274,16 @@ class Descent:
     def _rest(self, now_s: float) -> Ask:
         if self._for_s(now_s) > self._wait_s:
             raise FleetError(
-                f"down, and it still holds: {self._bears}; its services go on, and nothing is "
-                f"limp: {WAYS}"
+                f"down, but the robot still bears weight: {self._bears}; its services continue, "
+                f"and the drives stay armed: {WAYS}"
             )
         return Ask.NOTHING
 
 
 LOOK_S: Final = 0.02
-"""An intent that is not repeated ends within `assist.stale_ms`."""
+"""Period of a step, s. An intent that is not repeated ends within `assist.stale_ms`."""
 UNHEARD_S: Final = 0.5
-"""A state or a status that is older is not heard."""
+"""Age from which a state or a status is stale, s."""
 TELL_S: Final = 1.0
 WAITING_TELL_S: Final = 5.0
 
@@ -293,34 +293,34 @@ Tell = Callable[[str], None]
 
 
 def asker(verb: str) -> str:
-    """Return the requester's name for a verb, as `OperatorIntent.source` has it."""
+    """Return the requester's name for a verb, as in `OperatorIntent.source`."""
     return f"xrl {verb} by {user_name()} ({os.getpid()})"
 
 
 def other_asker(status: PlannerStatus | None, own: str = "") -> str:
-    """Return who else requests something of the planner; "" if only a scenario or nobody does."""
+    """Return another requester of the planner, except a scenario, or an empty string."""
     by = "" if status is None else status.requested_by
     return "" if by in (SCENARIO, own) else by
 
 
 def lower(robot: RobotConfig, run_dir: Path, tell: Tell, *, wait_s: float, simulated: bool) -> None:
-    """Go down, and wait until nothing bears on the legs; at once if nothing does.
+    """Go down, and wait until the legs carry nothing; return at once if they carry nothing.
 
-    Ctrl-C ends it: until it is down the robot stands where it is. Its weight is to be taken within
-    `wait_s`; of a simulated one it is enough that it is down.
+    Ctrl-C ends it: until the robot is down it stands where it is. Its weight must be taken within
+    `wait_s`; a simulated robot only needs to be down.
 
     Raises:
-        FleetError: it bears weight and cannot go down, or nothing takes its weight.
+        FleetError: it carries weight and cannot go down, or nothing takes its weight.
     """
     try:
         with open_session(robot, "down", run_dir) as session:
             _Lowering(robot, session, tell, simulated=simulated).run(Descent(robot, wait_s))
     except BusError as error:
-        raise FleetError(f"{error}; so nobody knows whether it bears weight: {WAYS}") from None
+        raise FleetError(f"{error}; so it is unknown whether it carries weight: {WAYS}") from None
 
 
 class _Lowering:
-    """One way down."""
+    """One descent."""
 
     def __init__(
         self, robot: RobotConfig, session: Session, tell: Tell, *, simulated: bool
@@ -339,7 +339,7 @@ class _Lowering:
         self._seq = 0
 
     def run(self, descent: Descent) -> None:
-        """Look, ask and tell until it is over."""
+        """Receive, step, request and report until the descent is over."""
         heard: list[tuple[float, JointState | PlannerStatus | None]] = [(0.0, None)] * 7
         told_s, phase, ask = 0.0, descent.phase, Ask.NOTHING
         try:
@@ -366,7 +366,7 @@ class _Lowering:
                 time.sleep(LOOK_S)
         except KeyboardInterrupt:
             self._tell(
-                "interrupted: its services go on, and "
+                "interrupted: its services continue, and "
                 + (
                     "it stands where it is"
                     if descent.phase in (DescentPhase.LOOKING, DescentPhase.LOWERING)
@@ -379,12 +379,12 @@ class _Lowering:
                 self._put_intent(sit=False)
 
     def _ask(self, ask: Ask, phase: DescentPhase, status: PlannerStatus | None) -> None:
-        """Repeat what is asked for; a simulated person keeps the hand off until it is down."""
+        """Repeat the request; a simulated person keeps the hand off until the robot is down."""
         if ask in (Ask.SIT, Ask.STOP) and not self._seq:
             require_operator(self._robot, "down")
             if other := other_asker(status, self._source):
-                raise FleetError(f"{other} asks the robot for something else; end that first")
-            # the person who is carried is carried on
+                raise FleetError(f"{other} requests something else from the robot; end that first")
+            # the assist continues during the descent
             self._assist_n = status.assist_requested_n if status is not None else 0.0
         if ask is Ask.STOP:
             self._stops.put(Estop(t_ns=now_ns(), seq=self._seq, source=self._source))

@@ -19,14 +19,14 @@ from shared.toml_file import check_ranges
 
 
 class Number(NamedTuple):
-    """A word that takes a number."""
+    """A word with a number as its value."""
 
     field: str
     """Field of `Inject`."""
     units: Mapping[str, str]
     """Unit after a number, and the factor to SI."""
     like: str
-    """What would be right."""
+    """Hint with valid values."""
 
 
 _MS: Final = {"": "1", "us": "0.001", "ms": "1", "s": "1000"}
@@ -36,7 +36,7 @@ _PLAIN: Final = {"": "1"}
 _AS_MS: Final = "write 30 (ms), 0.03s or 500us"
 _AS_S: Final = "write 4 (s) or 500ms"
 _AS_SHARE: Final = "write 0.2 or 20%"
-_AS_RATE: Final = "write bytes a second, 10000 (tc-netem has bits)"
+_AS_RATE: Final = "write bytes per second, 10000 (tc-netem uses bits)"
 
 NUMBERS: Final[Mapping[str, Number]] = {
     "delay": Number("delay_ms", _MS, _AS_MS),
@@ -61,7 +61,7 @@ _FILE: Final = "--inject"
 
 
 def parse_inject(text: str) -> Inject:
-    """Parse `LINK key=value ...` for argparse; without `at` it starts with the scenario."""
+    """Parse `LINK key=value ...` for argparse; without `at` it begins with the scenario."""
     link, *words = text.replace(",", " ").split() or [""]
     try:
         return _made(link, _split(words))
@@ -71,7 +71,7 @@ def parse_inject(text: str) -> Inject:
 
 
 def _made(link: str, words: Mapping[str, str]) -> Inject:
-    """Return an impairment from its words, each with its value as written; errors name the word."""
+    """Return an impairment from its words and their values as written; errors name the word."""
     check_link(link)
     fields: dict[str, Any] = {"link": link, "at": 0.0}
     for word, text in words.items():
@@ -90,7 +90,7 @@ def _made(link: str, words: Mapping[str, str]) -> Inject:
         raise ConfigError(_FILE, word, found, right) from None
     problem = inject.fault()
     if not problem and inject.describe() == "nothing":
-        problem = "nothing is done to it; give a delay, a loss or another word"
+        problem = "it has no impairment; add a delay, a loss or another word"
     if problem:
         found, _, right = problem.partition("; ")
         raise ConfigError(_FILE, link, found, right)
@@ -104,7 +104,7 @@ def check_link(link: str) -> None:
     except ConfigError as error:
         near = _near(link, (*GROUPS, *DIRECTIONS))
         if link.endswith("-"):
-            near = "the shell took the rest for a file's name: put it in quotes; "
+            near = "the shell used the rest as a file name: put the argument in quotes; "
         raise ConfigError(_FILE, error.key, error.found, near + error.expected) from None
 
 
@@ -116,13 +116,13 @@ def _split(words: Iterable[str]) -> dict[str, str]:
             near = _near(key, (*NUMBERS, DISTRIBUTION, *SWITCHES))
             raise ConfigError(_FILE, word, "not understood", near + GRAMMAR)
         if key in found:
-            raise ConfigError(_FILE, word, f"a second {key}", "leave one out")
+            raise ConfigError(_FILE, word, f"a second {key}", "remove one of them")
         found[key] = value
     return found
 
 
 def _near(word: str, known: Iterable[str]) -> str:
-    """Return the beginning of a hint; empty if nothing is alike."""
+    """Return the beginning of a hint, empty if no known word is similar."""
     near = get_close_matches(word, known, n=1)
     return f"perhaps {near[0]!r}; " if near and near[0] != word else ""
 
@@ -131,7 +131,7 @@ def _number(word: str, text: str) -> float:
     _, units, like = NUMBERS[word]
     match = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d{1,3})?)([a-z%]*)", text)
     if match is None or match[2] not in units:
-        raise ConfigError(_FILE, word, f"{text!r} is not understood", like)
+        raise ConfigError(_FILE, word, f"{text!r} is not valid", like)
     return float(Decimal(match[1]) * Decimal(units[match[2]]))
 
 
@@ -144,6 +144,6 @@ def _distribution(text: str) -> str:
 
 
 def in_words_of(inject: Inject) -> str:
-    """Return an impairment as text: what, on which link, when."""
+    """Return an impairment as text: link, impairment, time."""
     lasts = "" if inject.duration is None else f" for {inject.duration:g} s"
     return f"{inject.link} {inject.describe()} at {inject.at:g} s{lasts}"

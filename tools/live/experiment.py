@@ -1,6 +1,6 @@
-"""What an experiment is to be: scenario and robot file, with the flags laid over them.
+"""Scenario and robot file of an experiment, with the flags applied to them.
 
-Shared by the verbs that run scenarios: the flags mean the same everywhere.
+The verbs that run scenarios share this code, so the flags mean the same everywhere.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ FAILED_START: Final = "failed-start.mcap"
 """Name of the record of the newest start that failed."""
 
 UNJUDGED = ("simulator", "recorder")
-"""A run cannot be judged without their part of it."""
+"""A run cannot be judged without these services."""
 
 _NUMBER = r"\d+(?:\.\d*)?"
 
 
 def choices(field: str) -> tuple[str, ...]:
-    """Return the values of a `[law]` key, for the flag of the same name."""
+    """Return the values of a `[law]` key, for the flag with the same name."""
     return get_args(get_type_hints(LawConfig)[field])
 
 
 class PlantFlags(Flags):
-    """How the simulated robot differs from its robot file."""
+    """Differences of the simulated robot from its robot file."""
 
     plant: Annotated[
         tuple[str, ...],
@@ -74,7 +74,7 @@ class PlantFlags(Flags):
 
 
 class ControllerFlags(Flags):
-    """A controller of somebody's own in the place of the law."""
+    """The user's own controller instead of the law."""
 
     controller: Annotated[str | None, Arg(metavar="FILE.py[:NAME]")] = None
     """your own controller instead of the law, behind the same certificate, age rule and limits
@@ -82,7 +82,7 @@ class ControllerFlags(Flags):
 
 
 class ImuFlags(Flags):
-    """An IMU, whatever the robot file says."""
+    """An IMU, regardless of the robot file."""
 
     imu: bool = False
     """add an IMU on the torso and its service: the robot then stands on slopes (imu.fitted of the
@@ -95,22 +95,22 @@ def _refused(text: str, form: str, **known: Iterable[str]) -> argparse.ArgumentT
 
 
 def _parse_kill(text: str) -> Kill:
-    """Read SERVICE@T[:SIGNAL]."""
+    """Parse SERVICE@T[:SIGNAL]."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})(?::(?:SIG)?(\w+))?", text)
     if match is None or match[1] not in SERVICES or (match[3] or "KILL") not in SIGNALS:
         form = "SERVICE@SECONDS or SERVICE@SECONDS:SIGNAL, for example planner@10:STOP"
         raise _refused(text, form, services=SERVICES, signals=SIGNALS)
     if match[1] in UNJUDGED:
         raise argparse.ArgumentTypeError(
-            f"{text!r}: without the {match[1]} there is nothing to judge the run by; "
-            "`xrl up` and `xrl kill` show what the fleet does then"
+            f"{text!r}: without the {match[1]} the run cannot be judged; to see what the fleet "
+            "does without it, use `xrl up` and `xrl kill`"
         )
     row = {"service": match[1], "at": float(match[2]), "signal": match[3] or "KILL"}
     return msgspec.convert(row, Kill)
 
 
 def _parse_restart(text: str) -> Restart:
-    """Read SERVICE@T."""
+    """Parse SERVICE@T."""
     match = re.fullmatch(rf"(\w+)@({_NUMBER})", text)
     if match is None or match[1] not in SERVICES:
         raise _refused(text, "SERVICE@SECONDS, for example planner@9", services=SERVICES)
@@ -118,7 +118,7 @@ def _parse_restart(text: str) -> Restart:
 
 
 def _parse_push(text: str) -> Push:
-    """Read T:DUR:FX,FY,FZ."""
+    """Parse T:DUR:FX,FY,FZ."""
     signed = rf"(-?{_NUMBER})"
     match = re.fullmatch(rf"({_NUMBER}):({_NUMBER}):{signed},{signed},{signed}", text)
     if match is None:
@@ -128,7 +128,7 @@ def _parse_push(text: str) -> Push:
 
 
 def parse_fault(text: str) -> Fault:
-    """Read MODULE[.AXIS]:KIND@T[:DUR]."""
+    """Parse MODULE[.AXIS]:KIND@T[:DUR]."""
     match = re.fullmatch(rf"(\w+)(?:\.([01]))?:(\w+)@({_NUMBER})(?::({_NUMBER}))?", text)
     if match is None or match[1] not in MODULES or match[3] not in FAULT_KINDS:
         form = "MODULE:KIND@SECONDS, for example knee_left:encoder@8, or knee_left.1:encoder@8:0.5"
@@ -140,17 +140,17 @@ def parse_fault(text: str) -> Fault:
 
 
 class LawFlags(ConfigFlags, ImuFlags):
-    """A robot, with its law changed for one run."""
+    """A robot whose law is changed for one run."""
 
     split: Annotated[str | None, Arg(choices=choices("split"))] = None
     """gain split of the law"""
     jacobian: Annotated[str | None, Arg(choices=choices("jacobian"))] = None
-    """how the legs share the load; average implies the diagonal split, because no gains certify
+    """load sharing of the legs; average implies the diagonal split, because no gains certify
     it"""
 
 
 class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
-    """What shapes an experiment."""
+    """The flags of an experiment."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
     """scenario: a name (of a file in scenarios/ beside the robot file, or of a shipped one), or a
@@ -186,16 +186,16 @@ class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
     )
     """impair a link, such as 'planner->joints delay=30 jitter=10 at=3 for=4' (ms
     and s), 'all loss=20% burst=5', 'planner->left partition at=3'; at is scenario time; `xrl inject
-    --help` explains each word, and which of several applies; replaces the scenario's; may be
-    repeated"""
+    --help` explains each word, and which of several applies; replaces the scenario's impairments;
+    may be repeated"""
     seed: Natural = 0
     """seed of the sensors' noise and of the network's losses and delays"""
 
 
 ROW_FIELDS: Final = ("kill", "restart", "push", "fault", "inject")
-"""Rows of a scenario that flags of the same name give."""
+"""Rows of a scenario that flags with the same name set."""
 SHOWN: Final = 12
-"""Happenings that the first line of a run names."""
+"""Maximum number of actions in the first line of a run."""
 
 
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
@@ -209,13 +209,13 @@ def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
         if path.is_file():
             return path.absolute()
     known = ", ".join(sorted({file.stem for at in folders for file in at.glob("*.toml")}))
-    raise FleetError(f"no scenario {name!r}; one of {known}, or the path of a .toml file")
+    raise FleetError(f"no scenario {name!r}; must be one of {known}, or a path to a .toml file")
 
 
 def make_scenario(flags: ExperimentFlags) -> Scenario:
     """Return the scenario with the flags applied.
 
-    A shorter duration drops the file's rows beyond it; a flag that names a time beyond it is
+    A shorter duration drops the file's later rows. A flag with a time after the end is
     refused.
     """
     path = scenario_file(flags.scenario, flags.config)
@@ -235,7 +235,7 @@ def make_scenario(flags: ExperimentFlags) -> Scenario:
 
 
 def describe(scenario: Scenario) -> str:
-    """Return kills, faults and impairments as a clause for the run's first line."""
+    """Return the actions on the run as a clause for its first line."""
     done = [f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill]
     done += [f"{row.service} back at {row.at:g} s" for row in scenario.restart]
     done += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
@@ -247,17 +247,17 @@ def describe(scenario: Scenario) -> str:
 
 
 def introduce(scenario: Scenario, console: Console) -> None:
-    """Print what is about to happen."""
+    """Print the name of the scenario and its actions."""
     about = printable(f"{scenario.about}{describe(scenario)}")
     console.print(marked("[bold]{}[/]: {}", scenario.name, about))
 
 
 def make_robot(flags: LawFlags) -> RobotConfig:
-    """Return the robot with the flags laid over it."""
+    """Return the robot with the flags applied."""
     law = (("split", flags.split), ("jacobian", flags.jacobian))
     changes = {key: value for key, value in law if value is not None}
     if changes.get("jacobian") == "average" and "split" not in changes:
-        changes["split"] = "diagonal"  # no local gains certify it, so there is no schedule
+        changes["split"] = "diagonal"  # no local gains certify it, so it has no schedule
     return load_robot(flags.config, imu=flags.imu, **changes)
 
 
@@ -273,16 +273,16 @@ def load_robot(path: Path, *, imu: bool = False, **law: str) -> RobotConfig:
 
 
 def make_out(out: Path | None, verb: str) -> Path:
-    """Make the directory of a run's results; without a name, one of this verb and time."""
+    """Make the directory of a run's results; the default name has the verb and the time."""
     out = make_folder(out, verb)
     if (out / FIRST).exists():
-        raise RunError(f"{out}: holds a run already; choose another --out, or remove it")
+        raise RunError(f"{out}: already contains a run; choose another --out, or remove it")
     return out
 
 
 @contextlib.contextmanager
 def record_of_start(out: Path) -> Iterator[None]:
-    """Rename the record of a start that fails: it must not keep the next run from this folder."""
+    """Rename the record of a failed start, so that it does not block this folder."""
     record = out / FIRST
     is_new = not record.exists()
     try:
@@ -297,7 +297,7 @@ def record_of_start(out: Path) -> Iterator[None]:
 def write_inputs(
     out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
 ) -> tuple[Path, ...]:
-    """Write robot, scenario, plant and gain schedule, if there is one, beside a run's results."""
+    """Write robot, scenario, plant and, if present, gain schedule beside a run's results."""
     robot_path, scenario_path, plant_path = (
         out / name for name in ("robot.toml", "scenario.toml", PLANT_FILE)
     )

@@ -1,4 +1,4 @@
-"""A live run: a fleet in a run directory of its own, led by a tool and then stopped."""
+"""A live run: a fleet in its own run directory, led by a tool and then stopped."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ def run_live(
 ) -> T:
     """Start a fleet, call `lead`, stop the fleet; return what `lead` returns.
 
-    However it ends, no process and no run directory is left, and the logs are in `out`.
+    In every case, no process and no run directory is left, and the logs are in `out`.
 
     Args:
         out: folder for the run's log, its inputs and the services' logs.
         robot: the robot.
-        scenario: what the simulated operator and the drives do; kills are for `lead` to do.
-        lead: leads the run; it is given the fleet and a session on its bus.
-        verb: of the command line; names the run directory and the session.
-        seed: of the sensors' noise.
-        true_plant: how the simulated robot differs from `robot`.
-        no_restart: services that the supervisor leaves down when they end.
+        scenario: motion of the simulated operator and faults of the drives; `lead` does the kills.
+        lead: leads the run; receives the fleet and a session on its bus.
+        verb: verb on the command line; names the run directory and the session.
+        seed: seed of the sensors' noise.
+        true_plant: the simulated robot's differences from `robot`.
+        no_restart: services that the supervisor does not restart when they end.
         pace: clock rate of the fleet. None: the default, lowered step by step while the cores are
             full; the pace found becomes the default of this process.
-        controller: of somebody's own, `FILE.py[:NAME]`, in the place of the law.
-        tell: takes a line of text each time the pace is lowered.
+        controller: the user's own, `FILE.py[:NAME]`, instead of the law.
+        tell: receives a line of text each time the pace is lowered.
     """
     out = out.absolute()
     robot_path, overrides = _prepare(out, robot, scenario, seed, true_plant, controller)
@@ -71,7 +71,7 @@ def run_live(
 
     def again(text: str) -> None:
         for record in out.glob("run*.mcap"):
-            record.unlink()  # of a robot that stood and waited
+            record.unlink()  # of a robot that only stood and waited
         tell(text)
 
     return once(pace) if pace is not None else run_at_fitting_pace(once, again)
@@ -85,7 +85,7 @@ def _prepare(
     true_plant: PlantConfig,
     controller: str | None,
 ) -> tuple[Path, dict[str, list[str]]]:
-    """Write what the services read; return the robot file, and the words for each service."""
+    """Write the services' input files; return the robot file, and extra arguments per service."""
     robot_path, scenario_path, plant_path, *_ = experiment.write_inputs(
         out, robot, scenario, true_plant
     )

@@ -1,4 +1,4 @@
-"""Display of a live run: one line that is rewritten."""
+"""Display of a live run: one line that is updated."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from tools.terminal import Console, renewed
 PERIOD_S = 0.1
 PLAIN_PERIOD_S = 1.0
 UNHEARD_S = 0.5
-"""s; an older status of the planner is not shown."""
+"""Age from which a planner status is not shown, s."""
 
 
 class _PlannerNews(Protocol):
-    """Gives the planner's newest status (`shared.bus.session.Latest`)."""
+    """Source of the planner's newest status (`shared.bus.session.Latest`)."""
 
     def take(self) -> PlannerStatus | None:
-        """Return the newest message if it was not taken before, else None."""
+        """Return the newest message if it was not returned before, else None."""
 
 
 class LiveView:
-    """A line that is renewed in a terminal, or printed once a second into a file."""
+    """A line that is updated in a terminal, or printed once a second to a file."""
 
     def __init__(
         self, console: Console, injects: Sequence[Inject] = (), planner: _PlannerNews | None = None
@@ -49,18 +49,18 @@ class LiveView:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        """End the display; the line goes away."""
+        """End the display and remove the line."""
         self._renewed.__exit__(*error)
 
     def show(self, snapshot: LiveSnapshot) -> None:
-        """Show the run as it is now, unless that was done a moment ago."""
+        """Show the present state of the run, at most once per period."""
         now = time.monotonic()
         if now < self._next_s or snapshot.truth is None:
             return
         self._next_s = now + self._period_s
         status = self._hear(now)
         words = [snapshot.note, active(self._injects, snapshot.truth.scenario_s)]
-        if snapshot.truth.hoist == 0.0:  # of a hanging robot it only says that it hangs
+        if snapshot.truth.hoist == 0.0:  # while the robot hangs the planner only reports that
             words += said_by(status)
         note = "; ".join(word for word in words if word)
         self._print(Text(_line(snapshot.truth, snapshot.modes, note)))
@@ -79,7 +79,7 @@ def active(injects: Sequence[Inject], scenario_s: float) -> str:
 
 
 def said_by(planner: PlannerStatus | None) -> tuple[str, str]:
-    """Return what a person must know, and when a planner that waits after drop-outs leads again."""
+    """Return what a person must know, and when a planner that waits after dropouts leads again."""
     if planner is None:
         return "", ""
     why = printable(reason_of(planner))

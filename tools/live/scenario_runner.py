@@ -1,7 +1,7 @@
 """Leads a live run through its scenario: start, kills, restarts, end.
 
 It watches the simulated truth on the bus and acts by scenario time. Each action is published as a
-run event, so that the log alone shows all of them.
+run event, so the log alone shows all of them.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ from tools.fleet.stalls import Stall, StallWatch
 from tools.fleet.supervise import SupervisedFleet
 
 READY_TIMEOUT_S: Final = 45.0
-"""Longer than all that a planner waits after the first five drop-outs: a machine may stall."""
+"""Longer than a planner's waits after its first five dropouts, s: the machine may stall."""
 PATIENCE_S: Final = 10.0
-"""Start-up uses all cores. A robot that does not stand after this time gets as long again, in which
-the idle fraction is measured."""
+"""Start-up uses all cores. A robot that does not stand after this time, s, gets as much again, in
+which the idle fraction is measured."""
 SETTLE_S: Final = 2.0
-"""All six modules track for so long before the scenario starts."""
+"""Time for which all six modules must track before the scenario starts, s."""
 AFTER_FALL_S: Final = 1.0
-"""A run is ended so long after a fall."""
+"""Time from a fall to the end of the run, s."""
 SILENT_S: Final = 3.0
-"""The simulated world says nothing for so long: the run is over."""
+"""Timeout for the simulated world, s; then the run is over."""
 LAST_WORDS_S: Final = 0.3
-"""s; the last messages reach the recorder in this time."""
+"""Time in which the last messages reach the recorder, s."""
 POLL_S: Final = 0.004
 UNHEARD_S: Final = 0.5
-"""A module that says nothing for so long is shown as silent."""
+"""A module is shown as silent after this time without a message, s."""
 PIDS_EVERY_S: Final = 1.0
 STARTING: Final = "waiting for six modules to track"
 FULL_CORE: Final = 0.2
-"""With less idle time beside the fleet one of two cores may be full; of four it fills none."""
+"""With less idle time beside the fleet, one core of two may be full; of four cores, none is."""
 ENDING_S: Final = 3.0
-"""s; a service that was asked to end has done so by then, or was killed by its supervisor."""
+"""Timeout for a service to end after TERM or INT, s; by then it has ended or was killed."""
 
 
 class LiveSnapshot(NamedTuple):
@@ -65,28 +65,28 @@ class LiveSnapshot(NamedTuple):
 
     truth: SimTruth | None
     modes: tuple[str, ...]
-    """One letter for each module: D, H, T, damp, FAULT; `-` for one that never sent a state."""
+    """One letter per module: D, H, T, damp, FAULT; `-` for a silent module."""
     note: str
 
 
 class EndOfRun(NamedTuple):
-    """How a run ended."""
+    """The end of a run."""
 
     cpu_pct: float | None
-    """CPU use of all processes together, %: 100 is one core; None: the robot fell before the
-    scenario could begin."""
+    """CPU use of all processes together, %: 100 is one core; None if the robot fell before the
+    scenario could start."""
     scenario_s: float
-    """So long it was to stand."""
+    """Scenario time until which the robot had to stand."""
 
 
 class TriggeredKill(NamedTuple):
-    """A kill at no fixed time: when modules track again after a drop-out."""
+    """A kill without a fixed time: when modules track again after a dropout."""
 
     service: str
     modules: int
-    """So many track again,"""
+    """Number of modules that must track again."""
     after_s: float
-    """since so long."""
+    """Time from then to the kill, s."""
 
 
 class _CpuMeter:
@@ -98,7 +98,7 @@ class _CpuMeter:
         self._spent_s = 0.0
 
     def sample(self, pids: Iterable[int]) -> None:
-        """Add what each process has used since the sample before."""
+        """Add the time that each process has used since the previous sample."""
         self._end_s = time.monotonic()
         for pid, cpu_s in procfs.cpu_s_of((*pids, os.getpid())).items():
             self._spent_s += cpu_s - self._last.get(pid, cpu_s)
@@ -111,7 +111,7 @@ class _CpuMeter:
 
 
 class _ArmedKill:
-    """A triggered kill that has not been done yet."""
+    """A triggered kill that is still pending."""
 
     def __init__(self, kill: TriggeredKill | None) -> None:
         self._kill = kill
@@ -119,7 +119,7 @@ class _ArmedKill:
         self._at_s = math.inf
 
     def due(self, tracking: int) -> str | None:
-        """Return the service to kill, once, as soon as its time has come."""
+        """Return the service to kill, once, when its time has come."""
         kill, now_s = self._kill, time.monotonic()
         if kill is None:
             return None
@@ -133,7 +133,7 @@ class _ArmedKill:
 
 
 class _RunEvents:
-    """Publishes what is done to the run; the log alone then shows it."""
+    """Publishes the actions on the run, so that the log shows them."""
 
     def __init__(self, session: Session) -> None:
         self._publisher = session.publisher(topics.RUN_EVENT, RunEvent)
@@ -176,7 +176,7 @@ class ScenarioRunner:
         triggered_kill: TriggeredKill | None = None,
         tell: Callable[[str], None] = lambda _text: None,
     ) -> None:
-        """Subscribe; `tell` takes what is to be known of the machine before the start."""
+        """Subscribe; `tell` receives the description of the machine before the start."""
         self._fleet = fleet
         self._scenario = scenario
         self._show = show
@@ -203,16 +203,16 @@ class ScenarioRunner:
         """Wait until the robot stands, run the scenario to its end, or until `is_over`.
 
         Raises:
-            CoresFullError: the cores do not carry the fleet at its pace.
-            RunError: the robot did not come to stand, or the simulated world went silent.
-            FleetError: a service that was to be restarted could not be.
+            CoresFullError: the cores are too slow for the fleet at its pace.
+            RunError: the robot did not get to stand, or the simulated world fell silent.
+            FleetError: a service could not be restarted.
         """
         with self._stalls:
             return self._run(is_over)
 
     @property
     def said(self) -> list[RunEvent]:
-        """What was done to the run so far."""
+        """The actions on the run until now."""
         return self._events.said
 
     def _run(self, is_over: Callable[[], bool]) -> EndOfRun:
@@ -232,9 +232,9 @@ class ScenarioRunner:
             self._sample_processes(meter)
             truth = self._truth
             if truth is not None and truth.scenario_s < 0.0:
-                raise RunError("the simulator was started again, and its scenario is gone")
+                raise RunError("the simulator has restarted, and its scenario is lost")
             if truth is not None:
-                # between two truths the scenario's clock runs on with ours
+                # between two truths the scenario's clock advances with this process's clock
                 self._events.start_ns = _zero_ns(truth)
                 if truth.fallen and truth.scenario_s < fallen_at_s:
                     fallen_at_s, self._note = truth.scenario_s, "FALLEN"
@@ -257,7 +257,7 @@ class ScenarioRunner:
         time.sleep(LAST_WORDS_S)
 
     def _sample_processes(self, meter: _CpuMeter) -> None:
-        """Once a second: a kill must not wait for the supervisor to tell the process."""
+        """Read the processes once a second, so that a kill need not ask the supervisor."""
         now_s = time.monotonic()
         if now_s >= self._next_pids_s:
             self._next_pids_s = now_s + PIDS_EVERY_S
@@ -265,10 +265,10 @@ class ScenarioRunner:
             meter.sample(self._pids.values())
 
     def _wait_until_tracking(self, is_over: Callable[[], bool]) -> bool:
-        """Wait until the hoist is down and all six modules have tracked for a while.
+        """Wait until the hoist is down and all six modules have tracked for `SETTLE_S`.
 
-        While it tracks, the idle fraction of the cores decides whether they carry the fleet.
-        Returns False if the robot falls first: that is a finding, not an error.
+        While they track, the idle fraction of the cores decides whether they suffice.
+        Return False if the robot falls first, which is a result and not an error.
         """
         begin_s = time.monotonic()
         deadline, look_s = begin_s + machine_s(READY_TIMEOUT_S), begin_s + PATIENCE_S
@@ -297,7 +297,7 @@ class ScenarioRunner:
                 raise RunError(
                     f"not all six modules track after {READY_TIMEOUT_S:.0f} s: "
                     f"{(lead.why if lead else '') or self._describe_modes()}; "
-                    "the services' logs tell more"
+                    "see the services' logs"
                 )
             time.sleep(POLL_S)
         assert before is not None  # noqa: S101 - set with `since`
@@ -311,9 +311,9 @@ class ScenarioRunner:
         """Raise CoresFullError if the idle fraction of the cores is too small."""
         if idle < IDLE_LEAST:
             half = max(PACE_MIN, pace() / 2)
-            remedy = f"give `--pace {half:g}`" if half < pace() else "end other programs"
+            remedy = f"add `--pace {half:g}`" if half < pace() else "end other programs"
             raise CoresFullError(
-                f"the cores do not carry the fleet at {pace():g} of real time: "
+                f"the cores are too slow for the fleet at {pace():g} of real time: "
                 f"{100 * idle:.0f} % idle; modules: {self._describe_modes()}; {remedy}"
             )
 
@@ -324,7 +324,7 @@ class ScenarioRunner:
         )
 
     def _start(self) -> None:
-        """Ask the world to start until it has."""
+        """Request the start from the world until it has started."""
         asked, deadline = 0, time.monotonic() + 5.0
         while self._truth is None or self._truth.scenario_s < 0.0:
             asked += 1
@@ -354,16 +354,16 @@ class ScenarioRunner:
             note = "; ".join(word for word in (self._note, self._stall_words()) if word)
             self._show(LiveSnapshot(truth, modes, note))
         elif time.monotonic() - self._truth_at_s > SILENT_S and self._events.start_ns:
-            raise RunError(f"the simulator has said nothing for {SILENT_S:.0f} s; see its log")
+            raise RunError(f"the simulator has been silent for {SILENT_S:.0f} s; see its log")
         stalls = self._stalls.take()
         self._stalls.note_held(list(self._modes.values()).count(Mode.HOLD))
-        if self._note == STARTING:  # services that start take the machine's time, and hold
+        if self._note == STARTING:  # starting services load the machine, and the modules hold
             self._stalls.longest = Stall(0, 0)
         else:
             self._events.tell(stalls)
 
     def _stall_words(self) -> str:
-        """Return what to show of the longest stall of the last moments; empty if there was none."""
+        """Describe the longest recent stall; empty if there was none."""
         stalls = self._stalls
         if not stalls.is_recent(now_ns()) or self._note == STARTING:
             return ""
@@ -372,7 +372,7 @@ class ScenarioRunner:
         return f"{stalls.longest.words}{by_it}"
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
-        """Do what is due; the simulator does pushes and faults, and they are only recorded here."""
+        """Do an action that is due; the simulator does pushes and faults, this records them."""
         if isinstance(row, Kill):
             self._events.say(RunEventKind.KILLED, row.service, row.signal)
             self._killed = True
@@ -380,7 +380,7 @@ class ScenarioRunner:
             try:
                 os.kill(self._pids[row.service], number)
             except (KeyError, ProcessLookupError):
-                words = f"kill {row.service}@{row.at:g}: it has no process then"
+                words = f"kill {row.service}@{row.at:g}: it has no process at that time"
                 raise RunError(f"{words}; see logs/{row.service}.log") from None
             self._note = f"{row.service} {'stopped' if row.signal == 'STOP' else 'killed'}"
         elif isinstance(row, Restart):
@@ -406,7 +406,7 @@ class ScenarioRunner:
             self._act(Kill(service=service, at=scenario_s))
 
     def _wait_until_ended(self, service: str) -> None:
-        """Wait for a service that is still leaving after TERM or INT; one that is stopped stays."""
+        """Wait until a service has ended after TERM or INT, but not for a suspended one."""
         pid = self._pids.get(service)
         deadline = time.monotonic() + ENDING_S
         while pid is not None and time.monotonic() < deadline:
@@ -416,13 +416,13 @@ class ScenarioRunner:
 
 
 def describe_machine(idle: float) -> str:
-    """Return how the machine carries the fleet, from the idle fraction of its cores."""
+    """Describe the load of the machine, from the idle fraction of its cores."""
     words = f"{len(os.sched_getaffinity(0))} cores, {100 * idle:.0f} % idle beside the fleet"
     pause_ms = scheduling.real_time_pause_ms() if idle < FULL_CORE else 0.0
     if pause_ms:
         words += (
-            f"; a core that real time fills the kernel stops for {pause_ms:g} ms in each second: "
-            f"`sudo sysctl {scheduling.NO_PAUSE}`"
+            f"; the kernel stops a core that is full of real-time work for {pause_ms:g} ms in "
+            f"each second; to prevent that, run `sudo sysctl {scheduling.NO_PAUSE}`"
         )
     return words
 

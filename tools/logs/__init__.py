@@ -1,1 +1,1 @@
-"""Records of runs: found, read, executed again."""
+"""Records of runs: find, read and re-execute them."""

@@ -1,4 +1,4 @@
-"""How somebody led the simulated hand in a run, to lead it so again."""
+"""Recorded motion of the simulated hand in a run, for repeating it."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from shared.clock import NS_PER_S
 from tools.logs.run_log import NewestAt, RunLog
 
 EARLY_NS: Final = 1000
-"""Scenario time in lockstep is a sum of steps: a rounding error less than a message's, at times."""
+"""Margin, ns: scenario time in lockstep is a sum of steps, so it may be a rounding error early."""
 
 
 class HandRow(msgspec.Struct, frozen=True):
-    """One message of the person's, at its scenario time."""
+    """One message of the hand, at its scenario time."""
 
     at: float
     hand: HandLead
 
 
 def hand_path(log: RunLog) -> tuple[HandRow, ...]:
-    """Return how the hand was led while the scenario ran, in order; empty if nobody led it.
+    """Return the motion of the hand during the scenario, in order; empty if nobody led it.
 
-    Where it was led last before the scenario began is its first row: there it stayed.
+    The first row is the hand's last position before the scenario, where it stayed.
     """
     led: list[HandLead] = log.messages(topics.OPERATOR_HAND)
     truths: list[SimTruth] = log.messages(topics.SIM_TRUTH) if led else []
@@ -41,7 +41,7 @@ def hand_path(log: RunLog) -> tuple[HandRow, ...]:
         rows.append(HandRow(0.0, msgspec.structs.replace(before[-1], push=(0.0, 0.0, 0.0))))
     for hand in led:
         if hand.t_ns >= begin_ns:
-            # by the newest truth: a simulator that is late leaves time out
+            # by the newest truth, because a late simulator skips time
             truth = newest.at(hand.t_ns) or truths[0]
             after_ns = hand.t_ns - truth.t_ns - EARLY_NS
             rows.append(HandRow(max(0.0, truth.scenario_s + after_ns / NS_PER_S), hand))

@@ -18,39 +18,39 @@ class Impaired(NamedTuple):
     """One impairment, over all its directions."""
 
     link: str
-    """As requested: a direction, or a group of them."""
+    """A direction or a group of directions, as requested."""
     words: str
-    """The impairment, as `--inject` takes it."""
+    """The impairment, in the words of `--inject`."""
     directions: frozenset[str]
     """Directions, as named in `shared.links`."""
     begin_ns: int
-    """Monotonic, as of messages."""
+    """Monotonic clock of the messages."""
     end_ns: int | None
-    """None: its end is not in the log."""
+    """None if its end is not in the log."""
     passed: int | None
-    """Messages that went through while it was in force, all directions; None without an end."""
+    """Messages that passed while it was active, in all directions; None without an end."""
     lost: int | None
-    """Messages that it took away."""
+    """Messages that it dropped."""
 
     @property
     def title(self) -> str:
-        """Where, and what."""
+        """Link and impairment."""
         return f"{self.link} {self.words}"
 
     def begin_s(self, zero_ns: int) -> float:
-        """Return when it began, s after a stamp."""
+        """Return its start, s after a stamp."""
         return (self.begin_ns - zero_ns) / NS_PER_S
 
     def end_s(self, zero_ns: int) -> float | None:
-        """Return when it ended, s after a stamp; None if that is not in the log."""
+        """Return its end, s after a stamp, or None if that is not in the log."""
         return None if self.end_ns is None else (self.end_ns - zero_ns) / NS_PER_S
 
     def at(self, t_ns: int) -> bool:
-        """Return True if it was in force at a time."""
+        """Return True if it was active at a time."""
         return self.begin_ns <= t_ns and (self.end_ns is None or t_ns < self.end_ns)
 
     def when(self, zero_ns: int) -> str:
-        """Return for example `3.00 to 7.00 s`, in s after a stamp."""
+        """Return its interval in s after a stamp, for example `3.00 to 7.00 s`."""
         begin, end = self.begin_s(zero_ns), self.end_s(zero_ns)
         return f"from {begin:.2f} s on" if end is None else f"{begin:.2f} to {end:.2f} s"
 
@@ -64,8 +64,8 @@ class Impaired(NamedTuple):
 def impairments(events: Iterable[LinkEvent]) -> list[Impaired]:
     """Return all impairments in the order of their start.
 
-    A network proxy that was killed records no end, and its successor counts from 1 again: a number
-    that starts again ends the earlier impairment of that number.
+    A killed network proxy records no end, and its successor counts from 1 again. So a number that
+    begins again ends the earlier impairment with that number.
     """
     found: list[list[LinkEvent]] = []
     ends: list[list[LinkEvent]] = []
@@ -103,7 +103,7 @@ def _of(
 def touches(
     rows: Iterable[Impaired], module: str, times_ns: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Return, for each time, whether a link between the planner and a module was impaired."""
+    """Return, for each time, True if a link between the planner and a module was impaired."""
     mask = np.zeros(len(times_ns), dtype=bool)
     for row in rows:
         if row.directions & {f"planner->{module}", f"{module}->planner"}:

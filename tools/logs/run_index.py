@@ -1,8 +1,8 @@
-"""What a run's files hold and where, without their messages; which files belong to one run.
+"""Index of a run's files: their content and its places, without messages; the files of one run.
 
-A record of an hour has 2 GiB and, read whole, ten times that in memory. So its files are skimmed
-once, and `tools/logs/run_log.py` reads the parts that are needed. A split run is several files in
-one directory.
+A record of an hour has 2 GiB and, if read whole, takes ten times that in memory. So its files are
+skimmed once, and `tools/logs/run_log.py` reads only the needed parts. A split run consists of
+several files in one directory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _HOST: Final = re.compile(r"(?:tls|tcp)/(\[[^\]]+\]|[^:]+):")
 _OFFSET: Final = re.compile(r"-?[0-9]{1,20}")
 _EVER: Final = 1 << 64
 _CLOCK_MAX_NS: Final = 1 << 62
-"""More than any monotonic clock shows."""
+"""Larger than any value of a monotonic clock."""
 
 MetadataByName = dict[str, dict[str, str]]
 
@@ -48,9 +48,9 @@ def head_of(path: Path) -> MetadataByName:
 
 
 def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
-    """Return the files of the run that one of them belongs to, in order; that one at least.
+    """Return the files of the run that a file belongs to, in order; at least that file.
 
-    A recovered copy stands in for nothing: only if the original is gone it is taken.
+    A recovered copy is used only if the original is missing.
     """
     run = metadata.get("split", {}).get("run")
     if not run:
@@ -68,18 +68,18 @@ def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
 
 
 def files_in(directory: Path) -> list[Path]:
-    """Return the files of the one run in a directory, in order."""
+    """Return the files of the only run in a directory, in order."""
     runs = _runs_in(directory)
     if len(runs) > 1:
         first = ", ".join(run[0].name for run in runs)
-        raise RunError(f"{directory}: holds {len(runs)} runs ({first}); give the files of one")
+        raise RunError(f"{directory}: contains {len(runs)} runs ({first}); give the files of one")
     return runs[0]
 
 
 def _runs_in(directory: Path) -> list[list[Path]]:
-    """Return the files of each run in a directory: a recorder that restarts begins one."""
+    """Return the files of each run in a directory; a restarted recorder begins a new run."""
     names = _names(directory)
-    plain = [path for path in names if "." not in path.stem]  # not recovered or executed again
+    plain = [path for path in names if "." not in path.stem]  # not recovered or re-executed
     runs: list[list[Path]] = []
     unreadable: RunError | None = None
     for path in plain or names:
@@ -90,7 +90,7 @@ def _runs_in(directory: Path) -> list[list[Path]]:
         except RunError as error:
             unreadable = error
     if not runs:
-        raise unreadable or RunError(f"{directory}: holds no {SUFFIX} file; give a run's directory")
+        raise unreadable or RunError(f"{directory}: has no {SUFFIX} file; give a run's directory")
     return runs
 
 
@@ -104,7 +104,7 @@ def _number(metadata: MetadataByName) -> int:
 
 
 class _RecordedFile:
-    """A file, skimmed."""
+    """A skimmed file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -115,7 +115,7 @@ class _RecordedFile:
         """Full key of each channel."""
         self.chunks: list[ChunkPlace] = []
         self.damage: list[LostBytes] = []
-        """Places that could not be read, as far as they have been read."""
+        """Unreadable places in what has been read."""
         with open_log(path) as reader:
             for found in reader.skim():
                 if isinstance(found, ChunkPlace):
@@ -123,9 +123,9 @@ class _RecordedFile:
                 else:
                     self._learn(found)
             self.finished = reader.finished
-            """The recorder wrote the end of the file."""
+            """True if the recorder wrote the end of the file."""
             self.cut = reader.cut
-            """What follows the last whole record of a file that was cut off."""
+            """Rest after the last whole record of a file that was cut off."""
             self.damage += reader.damage
 
     def required(self, record: str, field: str) -> str:
@@ -133,25 +133,25 @@ class _RecordedFile:
         value = self.metadata.get(record, {}).get(field)
         if value is None:
             raise RunError(
-                f"{self.path}: no metadata {record}.{field}; an MCAP file written by "
-                "services.recorder, not cut off before its first message, is right"
+                f"{self.path}: no metadata {record}.{field}; must be an MCAP file written by "
+                "services.recorder that was not cut off before its first message"
             )
         return value
 
     @property
     def offset_ns(self) -> int:
-        """Wall clock in ns since 1970 = `t_ns` of a message + this."""
+        """Offset of the wall clock in ns since 1970 from the `t_ns` of a message."""
         text = self.required("clock", "offset_ns")
         if not _OFFSET.fullmatch(text):
-            raise RunError(f"{self.path}: clock.offset_ns is {text[:40]!r}; an integer is right")
+            raise RunError(f"{self.path}: clock.offset_ns is {text[:40]!r}; must be an integer")
         offset_ns = int(text)
         if max(abs(t - offset_ns) for t in self.span_ns or (offset_ns,)) > _CLOCK_MAX_NS:
-            raise RunError(f"{self.path}: its times and clock.offset_ns do not fit each other")
+            raise RunError(f"{self.path}: its times and clock.offset_ns contradict each other")
         return offset_ns
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """Log times of the first and the last message; None without any."""
+        """Log times of the first and the last message, or None without messages."""
         if not self.chunks:
             return None
         return min(c.first_ns for c in self.chunks), max(c.last_ns for c in self.chunks)
@@ -166,7 +166,7 @@ class _RecordedFile:
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
     ) -> Iterator[LogRecord]:
-        """Yield chunks that may hold messages of a log time (end exclusive) and of some keys."""
+        """Yield chunks that may contain messages of some keys at a log time (end exclusive)."""
         wanted = self._among(begin_ns, end_ns, keys)
         if not wanted:
             return
@@ -182,7 +182,7 @@ class _RecordedFile:
             self.damage += [loss for loss in reader.damage if loss not in self.damage]
 
     def _among(self, begin_ns: int, end_ns: int, keys: frozenset[str] | None) -> list[ChunkPlace]:
-        """Return the chunks to read; the first is always among them: it has the channels again."""
+        """Return the chunks to read, always with the first, because it repeats the channels."""
         others = {n for n, key in self.keys.items() if keys is not None and key not in keys}
         return [
             chunk
@@ -207,23 +207,23 @@ class _RecordedFile:
 
 
 class RunIndex:
-    """A run's files: what is said about it, and the places of its messages."""
+    """A run's files: their metadata, and the places of their messages."""
 
     def __init__(self, path: Path, files: Sequence[Path] = ()) -> None:
         self.path = path
         self.files = list(files) or (files_in(path) if path.is_dir() else [path])
-        """The files of the run, in order: several if it was split."""
+        """The files of the run, in order; several if it was split."""
         self._files = [_RecordedFile(file) for file in self.files]
         first = self._files[0]
         version = first.required("run", "schema_version")
         if version != SCHEMA_VERSION:
             raise RunError(
-                f"{path}: the log has schema version {version}, and this code reads "
+                f"{path}: the log has schema version {version}, but this code reads "
                 f"{SCHEMA_VERSION}: read it with the checkout that wrote it"
             )
         self.robot = first.required("run", "robot")
         self.offset_ns = first.offset_ns
-        """wall clock in ns since 1970 = `t_ns` of a message + `offset_ns`."""
+        """Offset of the wall clock in ns since 1970 from the `t_ns` of a message."""
         spans = [file.span_ns for file in self._files if file.span_ns is not None]
         self.began_ns = min((begin for begin, _ in spans), default=self.offset_ns)
         """Log time of the first message."""
@@ -237,7 +237,7 @@ class RunIndex:
 
     @property
     def length_s(self) -> float:
-        """Time from the first message to the last."""
+        """Time from the first message to the last, s."""
         return (self.ended_ns - self.began_ns) / 1e9
 
     @property
@@ -256,7 +256,7 @@ class RunIndex:
 
     @property
     def hosts(self) -> dict[str, str]:
-        """Host of each service, by the attached robot file; nothing if that says none."""
+        """Host of each service, by the attached robot file; empty if it does not name hosts."""
         text = self.attachments.get("robot.toml", b"")
         try:
             endpoints = tomllib.loads(decoded(text)).get("bus", {}).get("endpoints", {}).items()
@@ -270,7 +270,7 @@ class RunIndex:
 
     @property
     def recorded_beside(self) -> str:
-        """A service on the host of this record's recorder: a host may record its own services."""
+        """A service on the host of this record's recorder; each host may have a recorder."""
         return self.metadata["run"].get("of", "").partition(",")[0] or RECORDER
 
     @property
@@ -280,18 +280,18 @@ class RunIndex:
 
     @property
     def damage(self) -> list[LostBytes]:
-        """Places that could not be read, as far as they have been read: left out."""
+        """Unreadable places in what has been read; they are left out."""
         return [loss for file in self._files for loss in file.damage]
 
     @property
     def cut(self) -> LostBytes | None:
-        """What follows the last whole record of a file that was cut off."""
+        """Rest after the last whole record of a file that was cut off."""
         return next((file.cut for file in reversed(self._files) if file.cut is not None), None)
 
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
     ) -> Iterator[tuple[LogRecord, dict[int, str]]]:
-        """Yield those chunks of all files, each with the full keys of its channels."""
+        """Yield such chunks of all files, each with the full keys of its channels."""
         for file in self._files:
             for record in file.records(begin_ns, end_ns, keys):
                 yield record, file.keys

@@ -1,11 +1,11 @@
-"""Reads a run's messages from its files, finished or killed: all of it, or a part of its time.
+"""Reads a run's messages from its files, finished or killed: the whole run, or a part of its time.
 
-A killed file has no summary, and may end in the middle of a record; the readers of the mcap package
-find nothing in the first and may stumble over the second (docs/logs.md). `shared.mcap_log.reader`
-walks the records from the start and keeps every whole one; here they are sorted by key.
+A killed file has no summary, and may end inside a record. The readers of the mcap package find
+nothing without a summary, and may fail at a cut record (docs/logs.md). `shared.mcap_log.reader`
+walks the records from the start and keeps every whole one; this module sorts them by key.
 
-A whole run takes about 3 MB of memory for each of its seconds, and ten with its messages decoded.
-So what may be long is read by `parts_of`, one after the other.
+A whole run takes about 3 MB of memory per second, and ten with decoded messages. `parts_of`
+reads a long run part by part.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from tools.logs.run_index import RunIndex
 from tools.topic_keys import sender_of
 
 PART_S: Final = 30.0
-"""Length of a part: its messages, decoded, fit into some 0.4 GB."""
+"""Length of a part, s: its decoded messages take about 0.4 GB."""
 MARGIN_S: Final = 1.0
-"""Messages before and behind a part that are read with it: what a tick consumed or sent."""
+"""Time before and after a part that is read too, s: a tick's inputs and outputs."""
 WHOLE_MAX_S: Final = 600.0
-"""Longest time that is read at once."""
+"""Longest time that is read at once, s."""
 PICTURE_MAX_S: Final = 120.0
-"""Longest time in one picture of a run."""
+"""Longest time in one picture of a run, s."""
 RESTART_NS: Final = 60 * NS_PER_S
-"""A clock that jumps by more has restarted with its host. No link holds messages up for so long."""
+"""A clock that jumps by more than this has restarted with its host; no link delays that long."""
 ONE_CLOCK_NS: Final = 100 * NS_PER_MS
-"""Clocks that are nearer to each other are one clock: no two hosts start at the same time."""
+"""Clocks with a smaller offset are the same clock: two hosts never start that simultaneously."""
 
-SEE_INFO: Final = "`xrl log info` shows what the file holds"
-"""What to do about a part without messages."""
+SEE_INFO: Final = "`xrl log info` shows the content of the file"
+"""Advice for a part without messages."""
 
 
 class RunPart(NamedTuple):
@@ -61,16 +61,16 @@ class RunPart(NamedTuple):
 _EVER: Final = 1 << 62
 WHOLE: Final = RunPart()
 NOTHING: Final = RunPart(0.0, 0.0)
-"""Events alone."""
+"""Only events."""
 
 
 class Series:
-    """The messages of one key, in the order in which they were recorded."""
+    """The messages of one key, in the order of recording."""
 
     def __init__(self) -> None:
         self.payloads: list[bytes] = []
         self.received_ns: list[int] = []
-        """Reception by the recorder, monotonic clock."""
+        """Reception by the recorder, on the monotonic clock."""
         self.seq: list[int] = []
         self.decoded: list[Any] | None = None
 
@@ -83,14 +83,14 @@ class Series:
 
 
 class NewestAt:
-    """Finds the newest of rows, which are in the order of their stamps, at a time."""
+    """Finds the newest row at a time, among rows in the order of their stamps."""
 
     def __init__(self, rows: Sequence[Any], stamps: Sequence[int] | None = None) -> None:
         self._rows = rows
         self._stamps = [row.t_ns for row in rows] if stamps is None else stamps
 
     def at(self, t_ns: int) -> Any | None:
-        """Return the newest row at or before a time; None before the first."""
+        """Return the newest row at or before a time, or None before the first row."""
         index = bisect.bisect_right(self._stamps, t_ns) - 1
         return self._rows[index] if index >= 0 else None
 
@@ -98,13 +98,13 @@ class NewestAt:
 class RunLog:
     """The messages of a run, or of a part of it, in memory.
 
-    Messages are decoded on request, once for each key. Topics of events, which have no rate, are
-    always of the whole run: a mode or a cut link that began before a part holds in it.
+    Messages are decoded on request, once per key. Topics of events, which have no rate, are always
+    read for the whole run, since a mode or a cut link from before a part is still active in it.
 
-    Where the services ran on several hosts, `t_ns` of a message from another host than the
-    recorder's is brought to the recorder's clock (`_on_recorders_clock`), so that times can be
-    compared. With `as_sent` it is what the message says, as re-execution needs it. Other times in a
-    message stay its sender's.
+    Where services ran on several hosts, `t_ns` of messages from other hosts than the recorder's is
+    converted to the recorder's clock (`_on_recorders_clock`), so that times are comparable. With
+    `as_sent` it is not converted, as re-execution needs. Other times in a message remain on its
+    sender's clock.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class RunLog:
         began_ns, ended_ns = index.span_ns
         self.begin_ns = began_ns + _ns(part.begin_s)
         self.end_ns = min(began_ns + _ns(part.end_s), ended_ns + 1)
-        """The part, monotonic clock: from `begin_ns`, before `end_ns`."""
+        """The part on the monotonic clock: from `begin_ns`, before `end_ns`."""
         self.is_first = part.begin_s <= 0.0
         self.is_last = self.end_ns > ended_ns
         self.is_whole = self.is_first and self.is_last
@@ -133,7 +133,7 @@ class RunLog:
 
     @property
     def has_world(self) -> bool:
-        """True if a simulated world is in it."""
+        """True if the log contains a simulated world."""
         return bool(self.count(topics.SIM_TRUTH.key(self.robot)))
 
     def keys(self) -> list[str]:
@@ -141,7 +141,7 @@ class RunLog:
         return [key for key, series in self._series.items() if series.payloads]
 
     def count(self, key: str) -> int:
-        """Return the number of messages on a key; 0 for a key that is not in the file."""
+        """Return the number of messages on a key; 0 for an unknown key."""
         return len(self._of(key).payloads)
 
     def messages(self, topic: Topic, module: str = "") -> list[Any]:
@@ -158,29 +158,29 @@ class RunLog:
             except (msgspec.DecodeError, UnicodeDecodeError) as error:
                 version = self.metadata["run"].get("schema_version", "unknown")
                 raise RunError(
-                    f"{self.path}: {key}: a message is no {topic.type.__name__}: {error}; "
+                    f"{self.path}: {key}: a message is not a {topic.type.__name__}: {error}; "
                     f"the file has schema version {version}: read it with the code that wrote it"
                 ) from None
             series.decoded = self._aligned(decoded, topic, module, series.received_ns)
         return series.decoded
 
     def newest(self, topic: Topic, module: str = "") -> NewestAt:
-        """Return what finds the newest of `messages(topic, module)` at a time."""
+        """Return the finder of the newest of `messages(topic, module)` at a time."""
         return NewestAt(self.messages(topic, module))
 
     def raw(self, key: str) -> list[tuple[int, bytes, int]]:
-        """Return (monotonic reception, payload, number) of every message of a key."""
+        """Return (monotonic reception, payload, sequence number) of every message of a key."""
         series = self._of(key)
         return list(zip(series.received_ns, series.payloads, series.seq, strict=True))
 
     def began_ns(self) -> int:
-        """Return when the run's first message reached the recorder, monotonic; 0 if none did."""
+        """Return the monotonic time at which the recorder received the run's first message."""
         return self.index.span_ns[0]
 
     def received_ns(self, topic: Topic, module: str = "") -> list[int]:
-        """Return when each of `messages(topic, module)` reached the recorder.
+        """Return the time at which the recorder received each of `messages(topic, module)`.
 
-        Monotonic clock of the recorder's host: comparable with `t_ns` of senders there.
+        Monotonic clock of the recorder's host, as for `t_ns` of senders on that host.
         """
         return self._of(self._key(topic, module)).received_ns
 
@@ -191,7 +191,7 @@ class RunLog:
         )
 
     def count_into(self, counts: dict[str, KeyCount]) -> None:
-        """Count the messages of this part, without its margins, after those of the parts before."""
+        """Add the counts of this part, without its margins, to those of the parts before."""
         for key in self.keys():
             count = counts.setdefault(key, KeyCount(several=topics.several_may_write(key)))
             for t_ns, _, seq in self.raw(key):
@@ -199,7 +199,7 @@ class RunLog:
                     count.feed(seq)
 
     def gaps(self) -> dict[str, KeyCount]:
-        """Return counts, gaps and restarts of every key with messages, from the file itself."""
+        """Return counts, gaps and restarts of every key with messages, from the file alone."""
         found: dict[str, KeyCount] = {}
         self.count_into(found)
         return found
@@ -208,7 +208,7 @@ class RunLog:
         """Return the log with only the messages received up to a time."""
         cut = copy.copy(self)
         series = {key: one.until(received_ns) for key, one in self._series.items()}
-        cut._series = series  # noqa: SLF001 - of the same class
+        cut._series = series  # noqa: SLF001 - an instance of the same class
         return cut
 
     def forget(self) -> None:
@@ -232,7 +232,7 @@ class RunLog:
 
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):
-            right = "name a module" if topic.per_module else "name none"
+            right = "name a module" if topic.per_module else "remove the module"
             raise RunError(f"{topic.name}: module {module!r} does not fit this topic; {right}")
         return topic.key(self.robot, module)
 
@@ -256,7 +256,7 @@ class RunLog:
         *,
         others: bool = True,
     ) -> None:
-        """Sort the messages of a time by key."""
+        """Sort the messages in a time range by key."""
         offset_ns = self.offset_ns
         first_ns, last_ns = first_ns + offset_ns, last_ns + offset_ns
         for record, keys_by_channel in self.index.records(
@@ -279,11 +279,11 @@ class RunLog:
 def _on_recorders_clock(sent_ns: Sequence[int], received_ns: Sequence[int]) -> list[int]:
     """Return the times of one sender's messages on the clock of the recorder that received them.
 
-    A monotonic clock counts from its host's start, so two of them are hours apart. The fastest
-    message is taken to have no delay: times are late by its delay, up to some milliseconds, and by
-    what the clocks drift apart in the part that is read (50 ppm are 1.5 ms in 30 s; of topics of
-    events the whole run is read). A host that restarts has another clock from then on. Messages
-    that a cut link held up keep their times.
+    A monotonic clock counts from its host's start, so those of two hosts differ by hours. The
+    fastest message is assumed to have no delay. So times are late by its delay, up to a few
+    milliseconds, and by the drift of the clocks in the part that is read (50 ppm are 1.5 ms in
+    30 s; for topics of events it is the whole run). A host that restarts has another clock from
+    then on. Messages that were delayed by a cut link keep their times.
     """
     late_ns = [got - sent for sent, got in zip(sent_ns, received_ns, strict=True)]
     restarts = [n for n, (a, b) in enumerate(pairwise(late_ns), 1) if abs(b - a) > RESTART_NS]
@@ -299,8 +299,8 @@ def _on_recorders_clock(sent_ns: Sequence[int], received_ns: Sequence[int]) -> l
 def read_run(path: Path, *, as_sent: bool = False) -> RunLog:
     """Read a run, finished or killed: a file, or all files of the run in a directory.
 
-    Raises RunError if a file is missing, empty or no run, the directory holds none or several, or
-    the run is longer than is read at once. `as_sent` leaves all times as they were sent.
+    Raises RunError if a file is missing, empty or not a run, the directory contains no run or
+    several, or the run is too long to read at once. `as_sent` keeps all times as sent.
     """
     return read_part(RunIndex(path), WHOLE, as_sent=as_sent)
 
@@ -313,14 +313,14 @@ def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLo
     read_s = min(part.end_s, length_s) - max(part.begin_s, 0.0)
     if read_s > WHOLE_MAX_S:
         raise RunError(
-            f"{index.path}: {read_s:.0f} s are more than the {WHOLE_MAX_S:g} s that are read at "
-            "once; give --from and --to"
+            f"{index.path}: {read_s:.0f} s exceed the {WHOLE_MAX_S:g} s that can be read at once; "
+            "choose a part with --from and --to"
         )
     return RunLog(index, part, as_sent=as_sent)
 
 
 def divided(index: RunIndex, part: RunPart, longest_s: float, multiple: int = 1) -> list[RunPart]:
-    """Return a part of a run in pieces of one length; several are a multiple of so many."""
+    """Divide a part of a run into equal pieces; if several, their number is a multiple."""
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     count = max(1, math.ceil((end_s - begin_s) / longest_s))
     count = multiple * math.ceil(count / multiple) if count > 1 else 1
@@ -338,10 +338,10 @@ def parts_of(
     as_sent: bool = False,
     done: Callable[[float], None] = lambda _s: None,
 ) -> Iterator[RunLog]:
-    """Yield a run, or a part of it, in parts that follow each other: one in memory at a time.
+    """Yield a run, or a part of it, in consecutive parts with only one in memory at a time.
 
-    Each forgets its messages when the next is asked for; `margin_s` before and behind is read too.
-    `done` takes how much of the run is behind, s.
+    Each part drops its messages when the next is requested; `margin_s` before and after is read
+    too. `done` receives the time of the run that has been read, s.
     """
     for piece in divided(index, part, part_s):
         log = RunLog(index, piece, margin_s, as_sent=as_sent)
@@ -351,7 +351,7 @@ def parts_of(
 
 
 def robot_of(log: RunLog | RunIndex) -> RobotConfig:
-    """Return the robot that a log was made with."""
+    """Return the robot with which a log was made."""
     raw = text_of(log, "robot.toml")
     robot = config_file.parse(raw, f"{log.path}: robot.toml")
     if "robot.wearer.toml" in log.attachments:
@@ -363,31 +363,31 @@ def robot_of(log: RunLog | RunIndex) -> RobotConfig:
     try:
         table = msgspec.json.decode(decoded(schedule), type=GainSchedule)
     except (msgspec.DecodeError, UnicodeError) as error:
-        raise RunError(f"{log.path}: robot.gains.json in it is no gain schedule: {error}") from None
+        raise RunError(f"{log.path}: robot.gains.json is not a gain schedule: {error}") from None
     return msgspec.structs.replace(robot, gain_schedule=table)
 
 
 def text_of(log: RunLog | RunIndex, name: str) -> str:
-    """Return a text file that is in a log."""
+    """Return a text file from a log."""
     try:
         return decoded(log.attachments[name])
     except KeyError:
-        raise RunError(f"{log.path}: holds no {name}; a run of this project has one") from None
+        raise RunError(f"{log.path}: has no {name}, as a run of this project does") from None
     except UnicodeError as error:
         raise RunError(f"{log.path}: {name} in it {error}") from None
 
 
 def has_own_controller(log: RunLog | RunIndex) -> bool:
-    """Return True if a controller of somebody's own led in the law's place."""
+    """Return True if a user's own controller led instead of the law."""
     return ATTACHED in log.attachments
 
 
 def refuse_own_controller(log: RunLog | RunIndex) -> None:
-    """Refuse a log whose planner was led by a controller of somebody's own."""
+    """Refuse a log whose planner was led by a user's own controller."""
     if has_own_controller(log):
         raise RunError(
-            f"{log.path}: a controller of somebody's own led ({ATTACHED} in it), and this computes "
-            "the shipped law; `xrl log resim --controller FILE` runs it again"
+            f"{log.path}: a controller of your own led ({ATTACHED} in it), but this command "
+            "computes the shipped law; `xrl log resim --controller FILE` executes it again"
         )
 
 

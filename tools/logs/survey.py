@@ -1,4 +1,4 @@
-"""Counts the contents of MCAP files: by file and by topic, finished or not, ours or foreign."""
+"""Counts the contents of MCAP files by file and by topic, finished or not, ours or foreign."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _NEVER: Final = -1
 
 
 class TopicFacts(msgspec.Struct, kw_only=True):
-    """One topic, over all files surveyed."""
+    """One topic, over all surveyed files."""
 
     schema: str
     nominal_hz: float
-    """From the table of topics at the recording; 0: events, or unknown."""
+    """Rate in the table of topics at the recording; 0 for events, or if unknown."""
     bytes: int | None = 0
-    """Size of the payload before compression, bytes. None: not read."""
+    """Size of the payload before compression, bytes; None if not read."""
     first_ns: int = _NEVER
     last_ns: int = _NEVER
     longest_gap_ns: int | None = 0
-    """Between two messages after each other; by the sender's clock in our logs. None: not read."""
+    """Longest time between consecutive messages, by the sender's clock in our logs, or None."""
     sequence: KeyCount = msgspec.field(default_factory=KeyCount)
 
     @property
@@ -49,7 +49,7 @@ class FileFacts(msgspec.Struct, kw_only=True):
     size: int
     finished: bool
     in_use: bool
-    """A recorder is writing it."""
+    """True if a recorder is writing it."""
     profile: str = ""
     library: str = ""
     messages: int = 0
@@ -57,27 +57,27 @@ class FileFacts(msgspec.Struct, kw_only=True):
     """Log times; -1 without messages."""
     last_ns: int = _NEVER
     orphans: int = 0
-    """Messages of channels that are nowhere described."""
+    """Messages of channels without a description."""
     passed_over: int = 0
     """Records of kinds that the format does not define."""
     attachments: dict[str, int] = msgspec.field(default_factory=dict)
     """Sizes by name."""
     metadata: MetadataByName = msgspec.field(default_factory=dict)
     counted: int | None = None
-    """Messages that its summary counts; None if it has none or is damaged."""
+    """Number of messages in its summary; None without one, or if it is damaged."""
     earlier_ends: int = 0
-    """Ends in the middle of the file: its writer finished it more than once."""
+    """Ends in the middle of the file, which its writer finished more than once."""
     cut: LostBytes | None = None
     damage: list[LostBytes] = msgspec.field(default_factory=list)
 
     @property
     def ours(self) -> bool:
-        """Return True for a log of this project, whatever its version."""
+        """Return True for a log of this project, of any version."""
         return self.profile == PROFILE
 
 
 class Survey:
-    """Files, and their topics taken together; feed it the files of a run in order."""
+    """Files and their combined topics; add the files of a run in order."""
 
     def __init__(self) -> None:
         self.files: list[FileFacts] = []
@@ -85,23 +85,23 @@ class Survey:
 
     @property
     def messages(self) -> int:
-        """Messages in all files."""
+        """Number of messages in all files."""
         return sum(file.messages for file in self.files)
 
     @property
     def first_ns(self) -> int:
-        """Log time of the first message; -1 without any."""
+        """Log time of the first message; -1 without messages."""
         return min((f.first_ns for f in self.files if f.messages), default=_NEVER)
 
     @property
     def last_ns(self) -> int:
-        """Log time of the last message; -1 without any."""
+        """Log time of the last message; -1 without messages."""
         return max((f.last_ns for f in self.files if f.messages), default=_NEVER)
 
     def add(self, path: Path, *, by_index: bool = False) -> FileFacts:
-        """Read a file. `by_index` takes what the recorder of a finished file of ours counted.
+        """Read a file. With `by_index`, use the recorder's own counts in a finished file of ours.
 
-        That is true to within a chunk, and finds no damage.
+        Those are exact to within a chunk, and find no damage.
         """
         for take in (_Reading.skim, _Reading.read) if by_index else (_Reading.read,):
             with open_log(path) as reader:
@@ -119,7 +119,7 @@ class Survey:
 
 
 class _Reading:
-    """One file being read."""
+    """A file while it is read."""
 
     def __init__(self, facts: FileFacts, topics: dict[str, TopicFacts]) -> None:
         self._facts, self._topics = facts, topics
@@ -136,7 +136,7 @@ class _Reading:
         return True
 
     def skim(self, reader: LogReader) -> bool:
-        """Take the recorder's own counts; return False if there are none that fit."""
+        """Use the recorder's own counts; return False if they are missing or do not fit."""
         places: list[ChunkPlace] = []
         others: list[McapRecord] = []
         for found in reader.skim():
@@ -194,7 +194,7 @@ class _Reading:
         self._channels[channel.id] = self._topics.setdefault(channel.topic, facts)
 
     def _count(self, record: LogRecord) -> None:
-        """Count the messages of a chunk; the hot loop."""
+        """Count the messages of a chunk (the hot loop)."""
         file, channels, ours = self._facts, self._channels, self._facts.ours
         for channel, seq, log_ns, publish_ns, start, end in record.rows:
             topic = channels.get(channel)
@@ -222,9 +222,9 @@ class _Reading:
 def _counted(
     records: list[McapRecord], names: Mapping[str, int], total: int | None
 ) -> dict[str, KeyCount] | None:
-    """Return what the recorder counted, by key; None if it does not fit the file any more.
+    """Return the recorder's counts by key, or None if they do not fit the file.
 
-    Another program may have left out messages, and copied the recorder's counts.
+    Another program may have dropped messages but copied the recorder's counts.
     """
     texts = next((m.metadata for m in records if isinstance(m, Metadata) and m.name == COUNTS), {})
     try:

@@ -1,1 +1,1 @@
-"""Leading by a gamepad or by keys: the pad's state, and where its deflections lead."""
+"""Leading with a gamepad or the keyboard: the pad's state, and the motion that it commands."""

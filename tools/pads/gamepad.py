@@ -1,6 +1,6 @@
-"""A gamepad, by SDL: the extra `pad`. SDL's database says which axis and button is which.
+"""A gamepad through SDL (extra `pad`). SDL's database identifies its axes and buttons.
 
-SDL opens neither a display nor a window for a pad. Its hints and mappings are those of the
+SDL opens neither a display nor a window for a pad. Its hints and mappings come from the
 environment, as in a game: `SDL_GAMECONTROLLERCONFIG` maps a pad that the database lacks.
 """
 
@@ -18,14 +18,14 @@ sdl2: Any = late("sdl2")
 
 STICKS: Final = {"lefty": "left stick", "righty": "right stick"}
 TRIGGERS: Final = {"lefttrigger": "left trigger", "righttrigger": "right trigger"}
-"""SDL's names of the axes, and ours."""
+"""SDL's names of the axes, and the names for messages."""
 BUTTONS: Final = ("a", "b", "x", "y", "leftshoulder", "rightshoulder", "back", "start")
-"""By place, as on an Xbox pad: `a` is below, `b` right, `x` left, `y` above."""
+"""By position, as on an Xbox pad: `a` is below, `b` right, `x` left, `y` above."""
 STICK_REST_MAX: Final = DEAD_ZONE
 """Largest deflection of a released stick.
 
-Within it the rest position is learnt. It is no more than the dead zone: a stick that was held while
-its rest was learnt leads nowhere once it is released.
+Within it the rest position is learned. It does not exceed the dead zone, so a stick that was held
+while its rest was learned commands no motion after its release.
 """
 TRIGGER_REST_MAX: Final = 0.1
 """Largest deflection of a released trigger."""
@@ -33,22 +33,22 @@ _FULL: Final = 32767.0
 
 
 class Gamepad:
-    """Sticks and buttons as they are now.
+    """Present state of sticks and buttons.
 
     Attributes:
-        name: of the pad.
-        gone: it was unplugged, or its receiver lost it.
+        name: name of the pad.
+        gone: the pad was unplugged, or its receiver lost it.
         stopped: the stop was pressed, however briefly.
-        settled: the rest positions of sticks and triggers are known; until then nothing is led.
+        settled: the rest positions of sticks and triggers are known; until then it cannot lead.
     """
 
     def __init__(self, index: int, *, hold: str = "rightshoulder", stop: str = "b") -> None:
-        """Open a pad of SDL by its index, with the dead man's button and the stop by name."""
+        """Open a pad by its SDL index, with the names of the dead man's button and the stop."""
         self._pad = sdl2.SDL_GameControllerOpen(index)
         self.name = _text(sdl2.SDL_GameControllerNameForIndex(index))
         self.gone, self.stopped, self.settled = not self._pad, False, False
         if self.gone:
-            raise FleetError(f"{self.name}: cannot be opened: {_text(sdl2.SDL_GetError())}")
+            raise FleetError(f"{self.name}: cannot open it: {_text(sdl2.SDL_GetError())}")
         self._hold, self._stop = self._button(hold), self._button(stop)
         self._is_down = self._was_pressed = False
         self._axes = {name: self._axis(name) for name in (*STICKS, *TRIGGERS)}
@@ -65,7 +65,7 @@ class Gamepad:
         axis = sdl2.SDL_GameControllerGetAxisFromString(name.encode())
         if not sdl2.SDL_GameControllerHasAxis(self._pad, axis):
             raise FleetError(
-                f"{self.name}: its mapping has no {name}; map it by SDL_GAMECONTROLLERCONFIG"
+                f"{self.name}: its mapping has no {name}; map it with SDL_GAMECONTROLLERCONFIG"
             )
         return int(axis)
 
@@ -78,7 +78,7 @@ class Gamepad:
     def deflection(self) -> Deflection:
         """Left stick: height; right stick: pitch (forward is forward); triggers: assist.
 
-        A lost pad deflects nothing.
+        A lost pad has zero deflection.
         """
         if self.gone:
             return Deflection()
@@ -86,7 +86,7 @@ class Gamepad:
         return Deflection(-way["lefty"], -way["righty"], way["righttrigger"] - way["lefttrigger"])
 
     def _position(self, name: str) -> float:
-        """Return an axis as SDL has it: -1 to 1 of a stick, 0 to 1 of a trigger."""
+        """Return an axis value from SDL: -1 to 1 for a stick, 0 to 1 for a trigger."""
         value = sdl2.SDL_GameControllerGetAxis(self._pad, self._axes[name])
         return max(-1.0, float(value) / _FULL)
 
@@ -99,14 +99,14 @@ class Gamepad:
         return off / (1.0 - rest if off > 0.0 else 1.0 + rest)
 
     def settle(self) -> str:
-        """Learn the rest positions of released sticks and triggers; return what is left to do."""
+        """Learn the rest positions of released sticks and triggers; return the next instruction."""
         held = []
         for name, shown in (STICKS | TRIGGERS).items():
             off = abs(self._position(name))
             if off > (STICK_REST_MAX if name in STICKS else TRIGGER_REST_MAX):
                 held.append(f"{shown} ({100.0 * off:.0f} %)")
         if held:
-            return f"let go of: {', '.join(held)}; if nobody holds it, move it once"
+            return f"let go of: {', '.join(held)}; if already released, move it once"
         if not self._was_pressed:
             return "press the dead man's button once"
         if self._is_down:
@@ -116,7 +116,7 @@ class Gamepad:
         return ""
 
     def wait(self, timeout_s: float) -> None:
-        """Take the events that come within a time, s."""
+        """Process the events that arrive within a time, s."""
         event = ctypes.byref(self._event)
         came = sdl2.SDL_WaitEventTimeout(event, round(1000 * timeout_s))
         while came:
@@ -136,19 +136,19 @@ class Gamepad:
 
 
 def start_sdl() -> None:
-    """Start SDL's gamepads, without a display and without its own handlers of signals."""
+    """Start SDL's gamepads, without a display and without its own signal handlers."""
     with warnings.catch_warnings():  # the package warns that it uses its own library
         warnings.simplefilter("ignore")
-        require("pad", "lead by keys: --keys")
+        require("pad", "lead with the keyboard: --keys")
     sdl2.SDL_SetHint(sdl2.SDL_HINT_NO_SIGNAL_HANDLERS, b"1")
     sdl2.SDL_SetHint(sdl2.SDL_HINT_JOYSTICK_ALLOW_BACKGROUND_EVENTS, b"1")
-    sdl2.SDL_SetHint(sdl2.SDL_HINT_GAMECONTROLLER_USE_BUTTON_LABELS, b"0")  # places, not letters
+    sdl2.SDL_SetHint(sdl2.SDL_HINT_GAMECONTROLLER_USE_BUTTON_LABELS, b"0")  # positions, not letters
     if sdl2.SDL_Init(sdl2.SDL_INIT_GAMECONTROLLER) != 0:
         raise FleetError(f"SDL does not start: {_text(sdl2.SDL_GetError())}; use --keys")
 
 
 def find_pad(wanted: str | None) -> int:
-    """Return the index of the first pad that SDL knows, or whose name or path holds a text."""
+    """Return the index of the first pad that SDL knows and whose name or path contains `wanted`."""
     start_sdl()
     found = []
     for index in range(sdl2.SDL_NumJoysticks()):
@@ -157,11 +157,11 @@ def find_pad(wanted: str | None) -> int:
         is_known = bool(sdl2.SDL_IsGameController(index))
         if is_known and (wanted is None or wanted in shown):
             return index
-        found.append(shown if is_known else f"{shown}, whose axes SDL does not know")
+        found.append(shown if is_known else f"{shown}, whose axes are unknown to SDL")
     raise FleetError(
         f"no gamepad{'' if wanted is None else f' {wanted!r}'}: "
         f"{'; '.join(found) or 'none that this user may read'}; join group `input`, "
-        "map an unknown pad by SDL_GAMECONTROLLERCONFIG, or use --keys"
+        "map an unknown pad with SDL_GAMECONTROLLERCONFIG, or use --keys"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a person with sticks or keys leads: height, pitch and assist, within limits. Pure."""
+"""Commands of a person with sticks or keys: height, pitch and assist, within limits. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PITCH_RATE: Final = 0.4
 ASSIST_RATE: Final = 40.0
 """N/s at full deflection."""
 DEAD_ZONE: Final = 0.2
-"""Deflection that counts as none: a worn stick stays up to 15 % away from where it rested."""
+"""Deflection that counts as zero: a worn stick rests up to 15 % away from its earlier position."""
 
 
 class Deflection(NamedTuple):

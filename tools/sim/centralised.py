@@ -6,8 +6,8 @@ planner also computes the joint services' part,
 
     tau = D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled
 
-with the states that it has, as one torque for each joint. The modules pass it to the drives
-unchanged until the next one comes. Pure.
+from the states that it has, as one torque for each joint. The modules send it to the drives
+unchanged until the next one arrives. Pure.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from tools.sim.lockstep import Lockstep
 
 
 class _LeadsOn(Engagement):
-    """Engages as shipped, and then leads with any states: no tier below it could hold."""
+    """Engages as shipped, then leads with any states, because no lower tier could hold."""
 
     def advance(
         self,
@@ -51,7 +51,7 @@ class _LeadsOn(Engagement):
         modes: list[int],
         inhibit: PlannerMode | None = None,
     ) -> bool:
-        """Take the modules' news, as `Engagement.advance`."""
+        """Update from the modules, as `Engagement.advance` does."""
         if self.mode is PlannerMode.LEADING:
             return False
         return super().advance(now_ns, fresh, ready, modes, inhibit)
@@ -66,19 +66,19 @@ class _CentralPlanner(Planner):
         self.state.engagement = _LeadsOn()
 
     def tick(self, now_ns: int) -> list[JointCommand]:
-        """Run the law; return six commands, `tau_ff` of which is all of a joint's torque."""
+        """Run the law; return six commands, whose `tau_ff` is a joint's whole torque."""
         commands = super().tick(now_ns)
         states: Sequence[JointState] = [state for state in self.state.states if state is not None]
         return [_whole(*pair) for pair in zip(commands, states, strict=True)] if commands else []
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
-        """Return inputs and decisions of the last tick; no margin, because no part stands alone."""
+        """Return inputs and decisions of the last tick, without margins: no part stands alone."""
         status = super().status(now_ns, tick_us)
         return msgspec.structs.replace(status, margin=0.0, margin_onboard=0.0)
 
 
 def _whole(command: JointCommand, state: JointState) -> JointCommand:
-    """Return the command with all that it asks for, in a state, as one torque."""
+    """Return the command with its whole torque at a state as one `tau_ff`."""
     return msgspec.structs.replace(
         command,
         v_ref=pd_law.ZERO,
@@ -93,12 +93,12 @@ def _whole(command: JointCommand, state: JointState) -> JointCommand:
 
 
 class _PassThrough(DriveManager):
-    """A joint module that passes torques on.
+    """A joint module that forwards torques.
 
-    It comes up as the shipped one, from the hoist through HOLD into TRACK. From the end of that
-    blend on it has no law: the newest torque that has come goes to the drive until the next
-    one, however old. The torque limiter keeps only the torque diamond. After an e-stop, or with a
-    lost drive, the shipped module's law is in force again.
+    It comes up as the shipped module does, from the hoist through HOLD into TRACK. After that blend
+    it has no law: the newest received torque goes to the drive, however old. The torque limiter
+    keeps only the torque diamond. After an e-stop, or with a lost drive, the shipped module's law
+    applies again.
     """
 
     def __init__(self, config: RobotConfig, name: str) -> None:
@@ -127,7 +127,7 @@ class _PassThrough(DriveManager):
         controller = self.state.controller
         controller.cycle += 1
         if reading is not None:
-            controller.estimate.take(reading, armed=True)
+            controller.estimate.process(reading, armed=True)
         if command is not None and all(map(math.isfinite, command.tau_ff)):
             controller.failsafe.command = command  # its age goes into the states
             controller.tau = limit_differential(command.tau_ff, self._tau_module_max)
@@ -140,7 +140,7 @@ class _PassThrough(DriveManager):
 
 
 def torques_only(config: RobotConfig) -> RobotConfig:
-    """Return the robot with drives that take torques and hold nothing by themselves.
+    """Return the robot with drives that take torques and hold nothing on their own.
 
     Its joint services accept any command, because this planner sends gains of zero.
     """
@@ -164,4 +164,4 @@ CONTROLS: Final[Mapping[str, type[Lockstep]]] = {
     SHIPPED: Lockstep,
     "centralised": CentralisedLockstep,
 }
-"""By who computes the torques."""
+"""Fleets by where their torques are computed."""

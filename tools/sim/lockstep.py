@@ -1,8 +1,8 @@
 """Lockstep: deterministic simulation in virtual time, in one process (docs/architecture.md).
 
 World, twelve emulated axes, six joint services, harness, IMU and planner step in a fixed order.
-Messages between them pass a modelled network. They are the objects of the live services, without
-process, clock or bus: two runs with one seed are equal to the last bit.
+Messages between them pass through a modelled network. The services are those of a live fleet,
+without process, clock or bus: two runs with one seed are equal to the last bit.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from tools.sim.virtual_services import (
 )
 
 SETTLE_NS = NS_PER_S
-"""The scenario starts this long after all six modules track, ns."""
+"""Time from when all six modules track to the scenario's start, ns."""
 READY_NS = 20 * NS_PER_S
-"""Virtual time by which the scenario must have started, ns. It starts at 1 s: 19 s of a run."""
+"""Virtual time by which the scenario must have started, ns: 19 s of a run, which starts at 1 s."""
 
 Happening = Kill | Restart | Push | HandRow
-"""What a scenario, or somebody who looks on, makes happen."""
+"""Action of a scenario, or of a person who watches the run."""
 Watch = Callable[[SimTruth], None]
-"""Sees the simulated world at its rate."""
+"""Receives the truth of the simulated world at its rate."""
 
 
 def forget(_topic: Topic, _module: str, _message: Message) -> None:
@@ -65,21 +65,21 @@ def forget(_topic: Topic, _module: str, _message: Message) -> None:
 
 
 class FleetMoment(msgspec.Struct, frozen=True):
-    """What the simulated world and each service are at one moment of a run."""
+    """State of the simulated world and of each service at one moment of a run."""
 
     state: SimState
     """World and drives."""
     modules: Mapping[str, DriveManagerState]
-    """State of each joint service; one that is not named is dead."""
+    """State of each joint service by name; a service that is missing is dead."""
     planner: tuple[int, PlannerState] | None
-    """Session and state of the planner; None: it is dead."""
+    """Session and state of the planner; None if it is dead."""
 
 
 class _Progress(msgspec.Struct):
-    """How far the run is."""
+    """Progress of the run."""
 
     todo: list[Happening]
-    """What the scenario still has, in its order."""
+    """Remaining actions, in order."""
     tracked_since_ns: int = 0
     sim_states: int = 0
     led: int = 0
@@ -120,19 +120,20 @@ class Lockstep:
             config: the robot as its controllers know it.
             scenario: what happens; it may kill and restart the planner and, with the onboard loop,
                 joint services.
-            network: of every link, each way; None is 1 ms. The scenario's impairments come on top.
-            seed: of the network and of the harness sensor's noise.
-            record: takes every message.
-            clocks: by service, of a host whose clock is not virtual time; not the simulator's.
-            plant: how the true robot differs from `config`; None: the realistic default.
-            hand: how somebody leads the hand in place of the scenario.
-            controller: makes a controller of somebody's own for each planner.
-            planner_beside: the planner's process is on the joint services' host, where its end is
-                seen at once; otherwise its commands grow old, which is harder.
-            traced: record also what re-execution of the services needs.
+            network: impairment of every link, each way; None is a delay of 1 ms. The scenario's
+                impairments come on top.
+            seed: seed of the network and of the harness sensor's noise.
+            record: called with every message.
+            clocks: by service, the clock of a host off virtual time; not the simulator's.
+            plant: how the true robot differs from `config`; None for the realistic default.
+            hand: recorded path of the hand, which replaces the scenario's.
+            controller: makes a custom controller for each planner.
+            planner_beside: True if the planner's process is on the joint services' host, where its
+                end is seen at once; otherwise its commands become stale, which is harder.
+            traced: also record what re-execution of the services needs.
 
         Raises:
-            RunError: the scenario kills a service that has no process here.
+            RunError: the scenario kills a service that cannot be killed here.
         """
         self._check_kills(config, scenario)
         self.config, self.scenario = config, scenario
@@ -188,7 +189,7 @@ class Lockstep:
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
 
     def _request(self) -> OperatorRequest:
-        """Return what the operator asks of the planner."""
+        """Return the operator's request to the planner."""
         wanted = self.world.lead()
         return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
 
@@ -199,7 +200,7 @@ class Lockstep:
 
     @property
     def estop(self) -> bool:
-        """Set it to stop every module."""
+        """The emergency stop; set it to stop every module."""
         return self._memory.estop
 
     @estop.setter
@@ -221,7 +222,7 @@ class Lockstep:
         return [joint.manager.state.controller for joint in self.joints]
 
     def moment(self) -> FleetMoment:
-        """Return what world and services are now, for `resume`; it shares what still changes."""
+        """Return the present state of world and services, for `resume`."""
         planner = self.planner
         return FleetMoment(
             self._robot.read_state(self.now_ns, 0),
@@ -246,8 +247,8 @@ class Lockstep:
     def run(self) -> Iterator[SimTruth]:
         """Run to the scenario's end; yield the truth at its rate.
 
-        Before the scenario starts its time is negative. Ends early if by then the robot has fallen,
-        or if the scenario has not started when virtual time is past `READY_NS`.
+        Scenario time is negative before the scenario starts. The run ends early if the robot has
+        fallen by then, or if the scenario has not started when virtual time is past `READY_NS`.
         """
         every = self._robot.every
         while self.world.scenario_s < self.scenario.duration:
@@ -288,14 +289,14 @@ class Lockstep:
         self.time.now_ns += robot.every.step
 
     def lead(self, hand: HandLead) -> None:
-        """Let somebody lead the hand in place of the scenario, and record it."""
+        """Set the hand's lead in place of the scenario's, and record it."""
         self._progress.led += 1
         hand = msgspec.structs.replace(hand, t_ns=self.now_ns, seq=self._progress.led)
         self.world.take_hand(hand)
         self._record(topics.OPERATOR_HAND, "", hand)
 
     def act(self, row: Happening) -> None:
-        """Carry out a row of the scenario, or of somebody who looks on, and record it."""
+        """Execute an action of the scenario, or of a person who watches, and record it."""
         if isinstance(row, HandRow):
             self.lead(row.hand)
             return
@@ -356,13 +357,12 @@ NOTHING_HAPPENS: Final = Scenario(
 
 
 def begin_standing(fleet: Lockstep) -> bool:
-    """Put a new fleet where the robot stands, all six track and its scenario begins.
+    """Start a new fleet when the robot stands, all six track and its scenario begins.
 
-    To stand up takes 3.6 s of each run. Where many runs of one robot on one plant follow each
-    other, it is stood up once in each process, and each run continues from there. Standing up
-    itself is tested by `tests/lockstep/test_dead_services.py` and by the sweeps over drawn plants:
-    they begin on the hoist. Returns False if this robot is never led on this plant: it then begins
-    on the hoist.
+    Standing up takes 3.6 s of each run. For many runs of one robot on one plant, the robot stands
+    up once in each process, and each run continues from there. Standing up itself is tested by
+    `tests/lockstep/test_dead_services.py` and by the sweeps over drawn plants, which start on the
+    hoist. Returns False if this robot never leads on this plant: it then starts on the hoist.
     """
     start = standing(fleet.config, fleet.plant)
     if start is not None:
@@ -371,7 +371,7 @@ def begin_standing(fleet: Lockstep) -> bool:
 
 
 def standing(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
-    """Return the moment at which a scenario begins over `BASE`; None if it never does."""
+    """Return the moment at which a scenario begins with `BASE`, or None if it never does."""
     schedule = robot.gain_schedule
     key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
     if key not in _known:

@@ -1,8 +1,8 @@
 """Modelled network links, seeded, with the scenario's impairments (docs/architecture.md). Pure.
 
-Its own impairment and those of `xrl sim --inject` are both `shared.config.impairment`: the network
-proxy of a live fleet uses the same class. A link here is never given up. There is neither lease nor
-dialling, and a stream delivers everything that a partition held back, however long it lasted.
+A link's own impairment and those of `xrl sim --inject` are both `shared.config.impairment`, which
+the network proxy of a live fleet uses too. A link here is never given up: there is neither lease
+nor dialling, and a stream delivers everything that a partition held back, however long it lasted.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ M = TypeVar("M", bound=Message)
 BASE: Final = Impairment(delay_ms=1.0)
 """Impairment of every link, each way, by default."""
 OVERHEAD_BYTES: Final = 40
-"""Key and header that travel with a payload."""
+"""Size of the key and header that are sent with a payload."""
 
 
 class VirtualLink(Generic[M]):
     """One direction between two processes; the receiver keeps the newest arrival only.
 
-    What comes behind a message that was sent later is dropped, as Zenoh does by its own
+    A message that arrives behind one that was sent later is dropped, as Zenoh does by its own
     sequence numbers.
     """
 
@@ -38,16 +38,16 @@ class VirtualLink(Generic[M]):
         """Start empty; `base` is the link's own impairment, the name one of `shared.links`."""
         self.direction = Direction(name, seed)
         self.overtaken = 0
-        """Messages that came too late, or twice, and were dropped."""
+        """Messages that arrived too late, or twice, and were dropped."""
         self._base = Impairer(base, f"{seed} {name} base")
         self._queue: list[tuple[int, int, M]] = []  # by arrival
         self._held: list[tuple[int, M]] = []
         self._sent = self._newest = 0
         self._stream_ns = 0
-        """When the last message of a stream has passed: until then all others wait for it."""
+        """Time at which the last message of a stream passes; until then all others wait for it."""
 
     def put(self, now_ns: int, message: M) -> None:
-        """Send."""
+        """Send a message."""
         self._sent += 1
         if self.direction.active is None and now_ns >= self._stream_ns:  # the usual case
             self._enter(now_ns, self._sent, message)
@@ -59,7 +59,7 @@ class VirtualLink(Generic[M]):
                 self._enter(self._behind(now_ns, release_ns), self._sent, message)
 
     def take(self, now_ns: int) -> M | None:
-        """Return the newest that has arrived, as a ring of depth 1 does; None if none has."""
+        """Return the newest message that has arrived, as a ring of depth 1 does; else None."""
         newest = None
         while self._queue and self._queue[0][0] <= now_ns:
             _, number, message = heapq.heappop(self._queue)
@@ -70,7 +70,7 @@ class VirtualLink(Generic[M]):
         return newest
 
     def release(self, now_ns: int) -> None:
-        """Release what a partition held back, if it is over: in order, each with its delay."""
+        """Release what an ended partition held back: in order, each with its delay."""
         if not self._held:
             return
         impairer = self.direction.active
@@ -83,9 +83,9 @@ class VirtualLink(Generic[M]):
             self._enter(release_ns, number, message)
 
     def _behind(self, now_ns: int, release_ns: int) -> int:
-        """Return when a message passes: not before what still waits on a stream.
+        """Return when a message passes: not before messages that still wait on a stream.
 
-        Also where that was sent under another impairment than is in force now.
+        This holds even if those were sent under an impairment that has ended.
         """
         if now_ns < self._stream_ns:
             release_ns = max(release_ns, self._stream_ns)
@@ -121,7 +121,7 @@ class VirtualNetwork:
     ) -> None:
         """Start with every link's own impairment; `injects` are further ones, with their times.
 
-        `record` takes an event whenever one of those starts or ends.
+        `record` is called with an event whenever one of those starts or ends.
         """
         self.links: dict[str, VirtualLink[Any]] = {
             name: VirtualLink(base, name, seed) for name in DIRECTIONS
@@ -139,7 +139,7 @@ class VirtualNetwork:
                 link.release(now_ns)
 
     def cut(self, link: str, for_s: float, scenario_s: float, now_ns: int) -> None:
-        """Cut links of `shared.links` off now, for a while: somebody who looks on wants it."""
+        """Cut off links of `shared.links` for `for_s` seconds, as a person who watches requests."""
         self._injections.begin(link, Impairment(partition=True), scenario_s + for_s, now_ns)
 
     def active(self, scenario_s: float) -> tuple[str, ...]:

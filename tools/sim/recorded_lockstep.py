@@ -32,9 +32,9 @@ from tools.sim.virtual_services import Record
 
 Outcome = TypeVar("Outcome")
 AFTER_FALL_S: Final = 1.0
-"""A recorded run goes on this long after a fall, s, so that the log shows it."""
+"""Time for which a recorded run continues after a fall, s, so that the log shows it."""
 DRAIN_EVERY: Final = 512
-"""Messages that wait before they are written."""
+"""Number of waiting messages at which they are written."""
 
 
 class RecordedMessages:
@@ -46,20 +46,20 @@ class RecordedMessages:
         self._newest_ns = 0
 
     def __len__(self) -> int:
-        """Return how many wait."""
+        """Return the number of waiting messages."""
         return len(self._queue)
 
     def put(self, topic: Topic, module: str, message: Message) -> None:
-        """Take a message as the bus would.
+        """Queue a message as the bus would.
 
-        Its arrival time is never before the previous message's. A joint service whose drive is
-        silent stamps its states with the last sample that it received.
+        Its arrival time is never before the previous message's, although a joint service whose
+        drive is silent stamps its states with the last sample that it received.
         """
         self._newest_ns = max(self._newest_ns, message.t_ns)
         self._queue.append((topic.key(self._robot, module), encode(message), self._newest_ns))
 
     def take(self) -> tuple[str, bytes, int] | None:
-        """Return the oldest, or None."""
+        """Return the oldest message, or None."""
         return self._queue.popleft() if self._queue else None
 
 
@@ -75,9 +75,9 @@ def record_run(
 ) -> Outcome:
     """Record one run into `run.mcap` with its inputs beside it, and return what `run` returned.
 
-    `run` gets the function that records a message and the one that sees the world, and simulates
-    `true_plant`. `metadata` is added to the log's facts, at least `lockstep` with the command or
-    the network. The files `attached` go into the log as well.
+    `run` gets the function that records a message and the one that receives the truth, and
+    simulates `true_plant`. `metadata` is added to the log's, with at least `lockstep`: the command
+    or the network. The files `attached` are attached to the log as well.
 
     Raises:
         RunError: the log cannot be written.
@@ -127,12 +127,12 @@ def simulate(
     hand: Sequence[HandRow] = (),
     controller: str | None = None,
 ) -> float:
-    """Record a run of the fleet in virtual time, to its end or a second past a fall.
+    """Record a run of the fleet in virtual time, to its end or one second past a fall.
 
-    Returns the simulated time, s. `network` comes on every link, beside the scenario's own
-    impairments; `seed` is of the sensors' noise and of the network. `control` is a name of
-    `CONTROLS`; `hand` leads in place of the scenario; `controller` is somebody's own,
-    `FILE.py[:NAME]`, in the place of the law.
+    Returns the simulated time, s. `network` applies to every link, beside the scenario's own
+    impairments; `seed` is for the sensors' noise and for the network. `control` is a key of
+    `CONTROLS`; `hand` leads in place of the scenario; `controller`, `FILE.py[:NAME]`, replaces the
+    law.
 
     Raises:
         RunError: the log cannot be written.

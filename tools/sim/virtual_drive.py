@@ -24,7 +24,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import DriveConfig
 
 ASK_EVERY_NS: Final = 100 * NS_PER_MS
-"""A heartbeat's period: with each of an idle axis the CAN driver asks for its count."""
+"""Period of heartbeats, ns; with each one of an idle axis, the CAN driver requests its count."""
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _LOST, _IDLE, _ARMED = DriveStatus.LOST, DriveStatus.IDLE, DriveStatus.ARMED
@@ -32,7 +32,7 @@ _UNACKNOWLEDGED: Final = DriveStatus.UNACKNOWLEDGED
 _CLOSED_LOOP: Final = AxisState.CLOSED_LOOP_CONTROL
 
 Apply = Callable[[], None]
-"""What a row of frames does to its drive."""
+"""Effect of a row of frames on its drive."""
 
 
 class VirtualBus:
@@ -40,9 +40,9 @@ class VirtualBus:
 
     Attributes:
         acknowledged: True while some node is there.
-        choked: True while frames of others fill the send queue: it takes none of ours.
-        ages_ns: of each row that waited and reached its drive then.
-        thrown_away: how many rows waited and were thrown away.
+        choked: True while frames of others fill the send queue, which then accepts none of ours.
+        ages_ns: ages of the rows that waited and then reached their drive.
+        thrown_away: number of rows that waited and were discarded.
     """
 
     def __init__(self, bank: AxisBank, axes: Sequence[int]) -> None:
@@ -54,7 +54,7 @@ class VirtualBus:
         self._waiting: list[tuple[int, Apply]] = []
 
     def advance(self, now_ns: int) -> None:
-        """See who is there; hand on what waits if anybody is."""
+        """Update which nodes are there; deliver waiting rows if any node is."""
         conditions = self._conditions
         deaf = conditions.silent | conditions.deaf
         self.acknowledged = not (deaf and deaf.issuperset(self._axes))
@@ -66,9 +66,9 @@ class VirtualBus:
                 apply()
 
     def put(self, now_ns: int, apply: Apply) -> None:
-        """Send a row that may have to wait; one that the socket has no room for is dropped.
+        """Send a row that may have to wait; if the socket has no room for it, it is dropped.
 
-        A probe is put on a bus that may have come back.
+        A probe may go to a bus that has come back.
         """
         if self.acknowledged:
             apply()
@@ -77,17 +77,17 @@ class VirtualBus:
 
     @property
     def waiting(self) -> int:
-        """How many rows wait."""
+        """Number of waiting rows."""
         return len(self._waiting)
 
     def restart(self) -> None:
-        """Throw away what waits."""
+        """Discard the waiting rows."""
         self.thrown_away += len(self._waiting)
         self._waiting.clear()
 
 
 class VirtualDrive:
-    """One ODrive of the bank: a `Drive`, in its own turns (`WiredDrive` knows the joint's)."""
+    """One ODrive of the bank: a `Drive`, in its own turns (`WiredDrive` has the joint's)."""
 
     def __init__(
         self,
@@ -100,9 +100,9 @@ class VirtualDrive:
         counts_per_turn: int,
         tells_heat: bool = False,
     ) -> None:
-        """Take the drives, which of them (0 .. 5), the clock of the service's host, and the bus.
+        """Set the drives, the index of this one (0 .. 5), its service's clock, and the bus.
 
-        Without a bus it has one of its own, on which somebody always acknowledges.
+        Without a bus, the drive has one of its own, on which a node always acknowledges.
         `tells_heat`: it reports its thermistors once a second, as firmware 0.6 does.
         """
         self._bus = bus or VirtualBus(bank, (2 * index, 2 * index + 1))
@@ -117,12 +117,12 @@ class VirtualDrive:
         self._heat_at_ns = clock() if tells_heat else None
         self._supply_at_ns, self._supply_v = 0, 0.0
         self._written = True
-        """False: the service is new, and reads the torques of a drive that it finds armed."""
+        """False for a new service, which reads the torques of a drive that it finds armed."""
 
     def assume_heard(self) -> None:
-        """Take now for the time of the drive's last sample."""
+        """Set the time of the drive's last sample to now."""
         self._sampled_ns = self._clock()
-        self._watch.heard(self._sampled_ns)
+        self._watch.received(self._sampled_ns)
 
     def start_service(self) -> None:
         """Start with a new service, which reads the torques that an armed drive carries."""
@@ -153,7 +153,7 @@ class VirtualDrive:
         if self._heat_at_ns is not None and is_responding and now_ns >= self._heat_at_ns:
             self._heat_at_ns = now_ns + HEAT_EVERY_NS
             fet, motor = self.thermistors()
-        if now_ns >= self._supply_at_ns:  # a driver asks for it now and then
+        if now_ns >= self._supply_at_ns:  # a driver requests it periodically
             self._supply_at_ns = now_ns + SUPPLY_EVERY_NS
             self._supply_v = bank.bus.state(a // 2)[0]
         return DriveReading(
@@ -170,7 +170,7 @@ class VirtualDrive:
         )
 
     def _encoder_zero(self, now_ns: int) -> Pair | None:
-        """Return `DriveReading.encoder_zero` as often as a drive's heartbeats have it asked for."""
+        """Return `DriveReading.encoder_zero` once per heartbeat, as a driver requests it."""
         if now_ns < self._ask_at_ns:
             return None
         self._ask_at_ns = now_ns + ASK_EVERY_NS
@@ -184,7 +184,7 @@ class VirtualDrive:
         return (a, b)
 
     def thermistors(self) -> tuple[Pair | None, Pair | None]:
-        """Return what the drive reports of output stages and motors, C; None: nothing."""
+        """Return the drive's readings of output stages and motors, C; None without thermistors."""
         if self._heat_at_ns is None:
             return None, None
         heat, (a, b) = self._bank.heat, self._axes
@@ -200,7 +200,7 @@ class VirtualDrive:
         self._send(apply)
 
     def write(self, target: MotorTarget) -> None:
-        """See `Drive.write`; number by number, which costs a third of writing slices."""
+        """See `Drive.write`; element by element, at a third of the cost of slices."""
         bank, (a, b) = self._bank, self._axes
 
         def apply() -> None:
@@ -261,7 +261,7 @@ class VirtualDrive:
             for axis in self._axes:
                 bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
 
-        # Between the probe and its echo lie two cycles at most: they are left out here.
+        # The at most two cycles between the probe and its echo are not modelled.
         self._send(apply)
 
     def _send(self, apply: Apply) -> None:
@@ -272,7 +272,7 @@ class VirtualDrive:
             self._put(now_ns, apply)
 
     def _put(self, now_ns: int, apply: Apply) -> None:
-        """Hand a row to the bus; the drive takes it if it is there, and feeds its watchdogs."""
+        """Put a row on the bus; a drive that is there receives it and feeds its watchdogs."""
         bus = self._bus
         if bus.choked:
             self._watch.refused(now_ns)
@@ -296,7 +296,7 @@ class VirtualDrive:
         """Watch the bus as the CAN link does, whose own frames come back once they are carried."""
         watch, bus = self._watch, self._bus
         if is_responding:
-            watch.heard(now_ns)
+            watch.received(now_ns)
             if bus.acknowledged and not (watch.waits or watch.unacknowledged):
                 return  # nothing can be due
         if bus.acknowledged and watch.waits:

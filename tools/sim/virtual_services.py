@@ -1,6 +1,6 @@
 """The services in virtual time: their own loops, over modelled links and clocks.
 
-Nothing of a service is written again here. What is added is how one is killed and started again.
+No service is reimplemented here; this module adds only how a service is killed and restarted.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from tools.sim.virtual_drive import VirtualBus, VirtualDrive
 M = TypeVar("M", bound=Message)
 
 Record = Callable[[Topic, str, Message], None]
-"""Takes what live would be on the bus: topic, module or "", message."""
+"""Called with each message that would be on a live bus: topic, module or "", message."""
 
 
 class HostClock:
     """The monotonic clock of one host.
 
-    It cannot step, whatever is done to the time of day, but no two hosts agree on it: an age is
-    measured on one clock only (docs/architecture.md#age-rule).
+    It does not step with the time of day, but no two hosts agree on it, so an age is measured on
+    one clock only (docs/architecture.md#age-rule).
     """
 
     def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
-        """Begin ahead of virtual time, and gain by `drift_ppm` millionths."""
+        """Start ahead of virtual time by `offset_ns`, and gain `drift_ppm` millionths."""
         self.offset_ns = offset_ns
         self.drift_ppm = drift_ppm
 
@@ -63,13 +63,13 @@ class HostClock:
 
 
 class VirtualTime:
-    """The time of a run, which all its processes share and none of them knows."""
+    """Virtual time of a run; its processes see it only through their host's clock."""
 
     def __init__(self, now_ns: int) -> None:
         self.now_ns = now_ns
 
     def on(self, clock: HostClock) -> Callable[[], int]:
-        """Return a host's clock, to be read now."""
+        """Return a function that reads a host's clock."""
         return lambda: clock.read(self.now_ns)
 
 
@@ -87,7 +87,7 @@ class _LinkInbox(Generic[M]):
 
 
 class _RecordOutbox(Generic[M]):
-    """The sending end of a link, if anybody listens, and of the record: an `Outbox`."""
+    """The sending end of a link, if there is a receiver, and of the record: an `Outbox`."""
 
     def __init__(
         self,
@@ -112,13 +112,13 @@ S = TypeVar("S")
 
 
 class SharedMemory:
-    """What the six joint services of a host know of each other, and the emergency stop.
+    """Rows that a host's six joint services share, and the emergency stop.
 
     Attributes:
         estop: set it to stop every module.
-        rows: as each service wrote its own last, in virtual time.
+        rows: last row of each service, in virtual time.
         planner: session of the planner's process on this host; 0 without one.
-        ended: session of the one that ended last.
+        ended: session of the planner that ended last.
     """
 
     def __init__(self) -> None:
@@ -127,7 +127,7 @@ class SharedMemory:
         self.planner = self.ended = 0
 
     def announce(self, session: int) -> None:
-        """Say which planner is on this host."""
+        """Set the session of the planner on this host."""
         self.planner = session
 
 
@@ -149,11 +149,11 @@ class _Neighbourhood:
         return self._ended
 
     def view(self, _host_ns: int) -> NeighbourView:
-        """Return what this module knows of the others; all rows are in virtual time."""
+        """Return this module's view of the others; all rows are in virtual time."""
         return view_of(MODULES[self._index], self._memory.rows, self._time.now_ns)
 
     def write(self, row: NeighbourRow, *, is_dead: bool = False) -> None:
-        """Write down where this module is; a dead one that never had a sample was there once."""
+        """Write this module's row; a dead module without a sample counts as one that was there."""
         offset_ns = self._clock() - self._time.now_ns
         if not row.t_ns:
             row = row._replace(t_ns=int(is_dead))
@@ -170,7 +170,7 @@ class VirtualJoint:
     """A joint service.
 
     Attributes:
-        frozen: stopped or dead; it runs no cycle, and its drive keeps what it has.
+        frozen: stopped or dead; it runs no cycle, and its drive keeps its last target.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class VirtualJoint:
 
     @property
     def manager(self) -> DriveManager:
-        """The service's decisions; another one takes its place from the next cycle on."""
+        """The service's drive manager; a new one acts from the next cycle on."""
         return self._loop.module
 
     @manager.setter
@@ -256,7 +256,7 @@ class VirtualJoint:
             self.drive.start_service()
 
     def resume(self, state: DriveManagerState | None) -> None:
-        """Continue from another run's service; None: it is dead."""
+        """Continue from another run's service; None if it is dead."""
         if state is None:
             self.kill(for_good=True)
         else:
@@ -269,7 +269,7 @@ class VirtualPlanner:
     """The planner's process.
 
     Attributes:
-        loop: its loop; None: there is no planner.
+        loop: the planner's loop; None without a planner.
         frozen: stopped or dead.
     """
 
@@ -288,7 +288,7 @@ class VirtualPlanner:
     ) -> None:
         """Start the service; `make` makes a planner with a session, now and at each restart.
 
-        `beside`: memory of the joint services' host, if it is the planner's as well.
+        `beside`: memory of the joint services' host, if the planner is on it too.
         """
         self.frozen = self._is_dead = False
         self._config, self._make, self._clock = config, make, time.on(clock)
@@ -346,7 +346,7 @@ class VirtualPlanner:
             self.planner = self._make(self._session)
 
     def resume(self, start: tuple[int, PlannerState] | None) -> None:
-        """Continue from another run's planner: its session and state; None: it is dead."""
+        """Continue from another run's planner: its session and state; None if it is dead."""
         if start is None:
             self.planner = None
             return
@@ -360,7 +360,7 @@ class VirtualCan(Generic[S]):
     """A sensor's CAN bus: a frame is received as soon as it is sent."""
 
     def __init__(self, assembler: FrameGroup[S]) -> None:
-        """Take what makes samples of the sensor's frames."""
+        """Set the assembler of the sensor's frames."""
         self._assembler = assembler
         self._newest: S | None = None
 
@@ -368,7 +368,7 @@ class VirtualCan(Generic[S]):
         """Do nothing: no client has to be admitted."""
 
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
-        """Take the frames of one sample."""
+        """Receive the frames of one sample."""
         for can_id, data in frames:
             self._newest = self._assembler.add(can_id, data) or self._newest
 
@@ -398,21 +398,21 @@ class VirtualHarness:
         self._request: TareRequest | None = None
 
     def advance(self) -> None:
-        """If it is time, sample what acts on the torso, and run one cycle of the service."""
+        """If a cycle is due, sample the wrench on the torso and run the cycle."""
         if not self._time.now_ns % self._robot.every.harness:
             self._robot.feel()
             self._loop.cycle(self._clock())
 
     def assume_tared(self) -> None:
-        """Set the tare as done: in the middle of a run the operator's load is on the cells."""
+        """Mark the tare as done: in the middle of a run, the operator's load is on the cells."""
         self._loop.state = tared_state(self._robot.harness.bias)
 
     def tare(self, request: TareRequest) -> None:
-        """Ask for a new zero, from the next cycle on."""
+        """Request a new zero, from the next cycle on."""
         self._request = request
 
     def take(self) -> TareRequest | None:
-        """Return the request that has come, or None."""
+        """Return the new request, or None."""
         request, self._request = self._request, None
         return request
 
@@ -436,7 +436,7 @@ class VirtualImu:
         self._loop = ImuLoop(frames, AttitudeLaw(config.imu), attitudes)
 
     def advance(self) -> None:
-        """If it is time, sample how the torso stands, and run one cycle of the service."""
+        """If a cycle is due, sample the torso's attitude and run the cycle."""
         robot = self._robot
         if robot.imu is not None and not self._time.now_ns % robot.every.imu:
             robot.imu.send(robot.world)

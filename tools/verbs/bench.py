@@ -1,7 +1,8 @@
-"""`xrl bench`: what each part of the fleet costs here; its bus and the whole fleet are beside it.
+"""`xrl bench`: measures the CPU time of each part of the fleet on this machine.
 
-Absolute times of a busy machine say little. Two versions are compared by `--against`, which runs
-both in turn, or by the ratio of each figure to the yardstick in the same table.
+`xrl bench bus` and `xrl bench fleet` measure the bus and the whole fleet. Absolute times on a busy
+machine mean little. To compare two versions, use `--against`, which runs both in turn, or compare
+the ratios of the figures to the yardstick in the same table.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ EXAMPLES: Final = """
 xrl bench
 xrl bench --against HEAD~1
 xrl bench --rounds 25 --json bench.json
-xrl bench bus                                # the bus compared with other transports
+xrl bench bus                                # compare the bus with other transports
 xrl bench bus --transport zenoh --transport datagrams --seconds 30
 xrl bench fleet                              # the whole fleet, live
 xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json
@@ -33,7 +34,7 @@ bus, fleet = bus_bench.run, fleet_bench.run
 
 
 def run(flags: AgainstFlags) -> int:
-    """Measure the parts and print; with --strict a missed target is a fault."""
+    """Measure and print; with --strict, a missed target returns the exit code of a fault."""
     require("sim")
     robot = config_file.load(flags.config)
     gain_schedule.require(robot, flags.config)
@@ -45,8 +46,9 @@ def run(flags: AgainstFlags) -> int:
             flags, ["bench"], flags.rounds or 9, lambda: bench.turn() if bench else {}, console
         )
     note = (
-        "Medians of the rounds' medians of the calling thread's CPU time. "
-        f"Cold: {SWEPT_BYTES >> 20} MiB are swept and {1e3 * ASLEEP_S:g} ms slept before a call. "
-        f"Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in NumPy."
+        "Each figure is the median over the rounds of a round's median CPU time of the calling "
+        f"thread. Cold: before each call, {SWEPT_BYTES >> 20} MiB are swept and the thread sleeps "
+        f"for {1e3 * ASLEEP_S:g} ms. Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in "
+        "NumPy."
     )
     return finish(flags, [row_of(figure, here, there) for figure in FIGURES], note, console)

@@ -1,4 +1,4 @@
-"""`xrl completion`: what completes verbs, options and files in bash, zsh or tcsh; by shtab."""
+"""`xrl completion`: prints a script (by shtab) that completes verbs, flags and files in a shell."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ xrl completion zsh > "${fpath[1]}/_xrl"
 
 
 class CompletionFlags(Flags):
-    """Which shell."""
+    """Shell that the script is for."""
 
     shell: Annotated[str, positional("SHELL", choices=tuple(shtab.SUPPORTED_SHELLS))]
-    """print it for this shell"""
+    """shell that the script is for"""
 
 
 def run(flags: CompletionFlags) -> int:
@@ -33,7 +33,7 @@ def run(flags: CompletionFlags) -> int:
 
 
 def _complete_paths(parser: argparse.ArgumentParser) -> None:
-    """Let every argument that is a path complete files, and its subparsers' too."""
+    """Enable file completion for every path argument of a parser and its subparsers."""
     for action in parser._actions:  # noqa: SLF001 - argparse has no other list of them
         if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001
             for below in dict.fromkeys(action.choices.values()):

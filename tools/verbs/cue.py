@@ -1,7 +1,8 @@
-"""`xrl cue`: tells the wearer at once when the robot stops following them, and when it does again.
+"""`xrl cue`: alerts the wearer as soon as the robot stops or resumes following.
 
-A person who leads on against a robot that holds tips it: docs/results.md#a-hand-that-leads-on. The
-terminal's bell rings at each change, or a command of your own sounds, lights or shakes something.
+A wearer who continues to lead a robot that holds tips it (docs/results.md#a-hand-that-leads-on). At
+each change the terminal's bell rings, or a command of your own makes a sound, a light or a
+vibration.
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ SILENT_S: Final = 0.5
 
 
 class Cue(Enum):
-    """What the wearer is told; the value is the command's argument."""
+    """State announced to the wearer; its value is the argument of the command."""
 
     FOLLOWS = "follows"
     """The planner leads, and all six modules track: the robot follows the hand."""
     HOLDS = "holds"
-    """It stands where it is, whatever the hand does. Stop leading."""
+    """The robot stands still, whatever the hand does. The wearer should stop leading."""
     SINKS = "sinks"
-    """A module damps or is disarmed: the robot goes down."""
+    """A module damps or is disarmed: the robot sinks."""
     FALLEN = "fallen"
 
 
 def cue_of(modes: Sequence[int | None], planner: int | None) -> Cue:
-    """Return what to tell the wearer.
+    """Return the state to announce.
 
     Args:
         modes: `Mode` of each module; None if it is silent.
@@ -56,21 +57,21 @@ def cue_of(modes: Sequence[int | None], planner: int | None) -> Cue:
 
 EXAMPLES: Final = """
 xrl cue                          # ring the terminal's bell at each change
-xrl cue play-for-wearer.sh       # run: play-for-wearer.sh holds, follows, sinks or fallen
-xrl cue -- spd-say --rate 50     # say it
+xrl cue play-for-wearer.sh       # run it with the argument holds, follows, sinks or fallen
+xrl cue -- spd-say --rate 50     # speak the state
 """
 
 
 class CueFlags(RunDirFlags):
-    """What makes the sound."""
+    """Command that announces the state."""
 
     command: Annotated[tuple[str, ...], positional("COMMAND")] = ()
-    """run at each change with follows, holds, sinks or fallen as its last argument; without one
-    the terminal's bell rings"""
+    """command to run at each change, with follows, holds, sinks or fallen as its last argument;
+    without a command the terminal's bell rings"""
 
 
 class _Heard:
-    """The newest message of each sender, and None once it is silent."""
+    """Newest mode of each sender that is not silent."""
 
     def __init__(self, session: Session) -> None:
         self._latest: dict[str, Latest[JointState] | Latest[PlannerStatus]] = {
@@ -81,7 +82,7 @@ class _Heard:
         self._seen: dict[str, tuple[float, int]] = {}
 
     def look(self) -> Cue:
-        """Return what holds now."""
+        """Return the current state."""
         now = time.monotonic()
         for name, latest in self._latest.items():
             message = latest.take()
@@ -92,12 +93,12 @@ class _Heard:
 
     @property
     def complete(self) -> bool:
-        """True if every sender was heard once."""
+        """True if a message has arrived from every sender."""
         return len(self._seen) == len(self._latest)
 
 
 def run(flags: CueFlags) -> int:
-    """Tell each change until Ctrl-C."""
+    """Announce each change until Ctrl-C."""
     fleet = SupervisedFleet.attach(flags.run_dir)
     console, stop = Console(), StopFlag()
     told: Cue | None = None
@@ -108,7 +109,7 @@ def run(flags: CueFlags) -> int:
             time.sleep(POLL_S)
             now = watched.look()
             if told is None and not watched.complete and time.monotonic() - began < SILENT_S:
-                continue  # the first messages are on their way
+                continue  # wait for the first messages
             if now is not told:
                 told = now
                 console.print(now.value)
@@ -126,4 +127,6 @@ def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
     try:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL)
     except OSError as error:
-        raise FleetError(f"{command[0]}: cannot be run: {error.strerror}") from None
+        raise FleetError(
+            f"{command[0]}: cannot be run: {error.strerror}; give an executable command"
+        ) from None

@@ -33,7 +33,7 @@ from tools.terminal import Console, marked
 from tools.view.serving import PortFlags, served_beside
 
 VIEW_S = 3600.0
-"""Longest run that a page leads, s of scenario time."""
+"""Maximum length of a run led from the page, s of scenario time."""
 
 
 EXAMPLES: Final = """
@@ -54,23 +54,23 @@ class DemoFlags(experiment.ExperimentFlags, PaceFlags, PortFlags):
     """An experiment, and how the fleet runs it."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = ""
-    """scenario: a name (of a file in scenarios/ beside the robot file, or of a shipped one), or a
+    """scenario: a file, or the name of a scenario that is shipped or in scenarios/ beside the robot
     file (default: squat, the paper's Fig. 7; with --view: stand)"""
     no_restart: bool = False
-    """do not restart services that end by themselves. A service that --kill kills stays down until
+    """do not restart services that end on their own. A service killed by --kill stays down until
     its --restart in either case"""
     view: bool = False
-    """show the robot in a browser, and let the page act on it; without --scenario and --duration it
-    stands until Ctrl-C, then the verdict follows"""
+    """show the robot in a browser and let the page act on it; without --scenario and --duration the
+    robot stands until Ctrl-C, then the verdict follows"""
     out: Folder | None = None
-    """where results go (default: out/demo-<time>)"""
+    """folder for the results (default: out/demo-<time>)"""
 
 
 def run(flags: DemoFlags) -> int:
     """Run the experiment; 0 only if the robot stood to the end."""
     require("sim")
     if flags.view:
-        require("view", "leave --view")
+        require("view", "leave out --view")
     console = Console()
     flags = dataclasses.replace(
         flags,
@@ -78,14 +78,14 @@ def run(flags: DemoFlags) -> int:
         duration=VIEW_S if flags.view and flags.duration is None else flags.duration,
     )
     robot, scenario = experiment.make_robot(flags), experiment.make_scenario(flags)
-    plant_from(flags.plant)  # refused before anything is started
+    plant_from(flags.plant)  # reject invalid values before anything is started
     out = experiment.make_out(flags.out, "demo")
     experiment.introduce(scenario, console)
     warn_of_others(console)
     try:
         ended = _lead_run(flags, robot, scenario, out, console)
     except KeyboardInterrupt:
-        console.print(f"interrupted; what was recorded until then is in {out}")
+        console.print(f"interrupted; the record up to this point is in {out}")
         raise
     return judge(out, scenario, ended, console)
 
@@ -93,7 +93,7 @@ def run(flags: DemoFlags) -> int:
 def _lead_run(
     flags: DemoFlags, robot: RobotConfig, scenario: Scenario, out: Path, console: Console
 ) -> EndOfRun:
-    """Run the scenario on a fleet of its own, and show it."""
+    """Run the scenario on its own fleet and show it."""
     console.print(
         f"starting {len(robot.services)} services; modes below: right ankle, knee, hip, then left; "
         "D disarmed, H hold, T track, F fault, - silent",
@@ -116,7 +116,7 @@ def _lead_run(
             return runner.run(ended.is_set)
 
     if flags.controller is not None:
-        controller_maker(flags.controller, robot)  # refused before anything is started
+        controller_maker(flags.controller, robot)  # reject it before anything is started
     return run_live(
         out,
         robot,
@@ -136,7 +136,7 @@ def _lead_run(
 
 @contextlib.contextmanager
 def _interrupts_set(event: threading.Event) -> Iterator[None]:
-    """Have Ctrl-C set an event meanwhile: the run ends there, and is judged. Twice interrupts."""
+    """Set an event on Ctrl-C, which ends and judges the run; a second Ctrl-C interrupts."""
 
     def interrupted(number: int, frame: FrameType | None) -> None:
         if event.is_set():

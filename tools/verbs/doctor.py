@@ -1,4 +1,4 @@
-"""`xrl doctor`: is this robot as it should be? Looks, and moves and changes nothing."""
+"""`xrl doctor`: checks the robot without moving or changing anything."""
 
 from __future__ import annotations
 
@@ -46,24 +46,24 @@ GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 
 
 class DoctorFlags(FleetRobotFlags):
-    """What is shown."""
+    """Form of the report."""
 
     verbose: bool = False
     """also show each check that is ok"""
     json: bool = False
-    """print JSON: every row"""
+    """print every row as JSON"""
 
 
 def run(flags: DoctorFlags) -> int:
-    """Look at everything; 0 if nothing is wrong."""
+    """Check everything; return 0 if nothing is wrong."""
     path = robot_file(flags)
     robot = config_file.load(path)
-    with Console(stderr=True).status("looking") as status:
+    with Console(stderr=True).status("checking") as status:
         groups = survey(
             robot,
             path,
             flags.run_dir,
-            lambda words: status.update(Text(f"looking at {words}")),
+            lambda words: status.update(Text(f"checking {words}")),
         )
     report = report_of(groups)
     if flags.json:
@@ -74,7 +74,7 @@ def run(flags: DoctorFlags) -> int:
 
 
 def survey(robot: RobotConfig, config_path: Path, run_dir: Path, progress: Progress) -> Groups:
-    """Check everything; if no fleet is up, an emulated robot's simulator runs meanwhile."""
+    """Check everything; if no fleet is up, start an emulated robot's simulator for the checks."""
     fleet_is_up = is_up(run_dir)
     progress("this computer, the robot file, the bus")
     groups: Groups = {
@@ -88,7 +88,7 @@ def survey(robot: RobotConfig, config_path: Path, run_dir: Path, progress: Progr
     services_up = bool(check_host.joint_services_up(robot, run_dir))
     over_can = robot.joint_service.driver == "odrive_can"
     if is_simulated(robot) and not fleet_is_up:
-        progress("starting the simulator: the drives are emulated, and no fleet is up")
+        progress("the emulated drives; starting their simulator, because no fleet is up")
     with drives_within_reach(robot, config_path, run_dir):
         traffic = {}
         for name in bus_nodes(robot):
@@ -110,7 +110,7 @@ def survey(robot: RobotConfig, config_path: Path, run_dir: Path, progress: Progr
 
 
 class _Usb:
-    """The round over USB; what of a board cannot be reached is a row too."""
+    """Checks over USB; a board that cannot be reached also gets a row."""
 
     def __init__(
         self, robot: RobotConfig, traffic: Mapping[str, BusTraffic], *, services_up: bool
@@ -134,13 +134,13 @@ class _Usb:
                 rows += check_board.alike_rows(self._read)
         except (DriveError, FleetError, MissingPackageError) as error:
             found_out, _, fix = str(error).removeprefix("USB: ").partition("; ")
-            rows.append(self._unreached("all drives", found_out, fix or "see there"))
+            rows.append(self._unreached("all drives", found_out, fix or "see the error"))
         return rows
 
     def _board(self, module: str, board: Board) -> list[Finding]:
-        """Check a board that is connected, and keep what it has."""
+        """Check a connected board and store its values."""
         rows = [
-            ok(module, "USB", board.serial_number, "there"),
+            ok(module, "USB", board.serial_number, "connected"),
             check_board.firmware_row(module, board.firmware),
         ]
         if not is_known(board.firmware):
@@ -158,10 +158,10 @@ class _Usb:
                 *check_board.condition_rows(module, values, levels, services_up=up),
             ]
         except DriveError as error:
-            return [self._unreached(module, str(error), "plug it in again; look at its cable")]
+            return [self._unreached(module, str(error), "plug it in again; check its cable")]
 
     def _position(self, module: str, board: Board | None) -> list[Finding]:
-        """Judge where a module is, by its bus if it is on one, else by its board."""
+        """Judge a module's position from its bus, or from its board if it is on no bus."""
         bus = self._traffic.get(self._robot.module_named(module).bus)
         turns = can_monitor.positions(self._robot, module, bus) if bus else None
         if turns is None and board is not None:
@@ -170,21 +170,31 @@ class _Usb:
                 values = board.read(names)
                 turns = (number(values, names[0]), number(values, names[1]))
             except DriveError:
-                return []  # its own row says so
+                return []  # another row reports this
         return [] if turns is None else check_board.position_rows(module, turns, self._robot)
 
     def _why_not(self, serial: str, found: FoundBoards) -> tuple[str, str]:
         """Return why a module's board was not reached, and what to do."""
         there = found.in_no_module(self._robot)
         if not serial:
-            return f"no serial_number{there}", "`serial_number` in its [[module]], by `odrivetool`"
-        trouble = f"{serial}: {found.troubles.get(serial, 'not there')}{there}"
+            return (
+                f"no serial_number{there}",
+                "set `serial_number` in its [[module]]; `odrivetool` shows it",
+            )
+        trouble = f"{serial}: {found.troubles.get(serial, 'not connected')}{there}"
         if self._services_up and self._on_usb:
-            return trouble, "its joint service has the USB: `xrl down` first"
-        return trouble, "plug its USB cable in; supply on; libusb-1.0 and the udev rule are there"
+            return trouble, "its joint service holds the USB; run `xrl down` first"
+        return trouble, "plug in its USB cable; check its supply, libusb-1.0 and the udev rule"
 
     def _unreached(self, subject: str, found: str, fix: str) -> Finding:
-        why = "its settings are not read back"
+        why = "its settings cannot be checked"
         if self._on_usb:
-            return wrong(subject, "USB", found, "there", fix, why)
-        return warning(subject, "USB", found, "there", fix, f"{why}: CAN of firmware 0.5 cannot")
+            return wrong(subject, "USB", found, "connected", fix, why)
+        return warning(
+            subject,
+            "USB",
+            found,
+            "connected",
+            fix,
+            f"{why}: CAN of firmware 0.5 does not report them",
+        )

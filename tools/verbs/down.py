@@ -15,34 +15,34 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.live.descent import WAYS, lower
 
 EXAMPLES: Final = """
-xrl down                      # a robot that bears weight goes down first, and waits to be hung
+xrl down                      # lower a robot that bears weight, and wait until it is hung
 xrl down --wait 300
 xrl down --limp               # idle the drives at once: a standing robot falls
-xrl down --lower-only         # go down and wait; the services go on
-xrl down --sit                # the same with the simulator, where it is not the rule
+xrl down --lower-only         # lower it and wait; the services keep running
+xrl down --sit                # also lower a simulated robot, which is otherwise stopped at once
 xrl down --limp --keep-stops  # from a systemd unit
 """
 
 
 class DownFlags(RunDirFlags):
-    """Which fleet, and what becomes of a robot that bears weight."""
+    """Fleet to stop, and how to treat a robot that bears weight."""
 
     limp: Annotated[bool, Arg(exclusive="weight")] = False
-    """idle the drives at once, whatever they bear: a standing robot falls"""
+    """idle the drives at once, under any load: a standing robot falls"""
     lower_only: Annotated[bool, Arg(exclusive="weight")] = False
-    """go down and wait until nothing bears on the legs, but stop nothing"""
+    """lower the robot and wait until its legs bear no weight, but keep the services running"""
     sit: Annotated[bool, Arg(exclusive="weight")] = False
-    """go down also where the robot is simulated (default: stop the simulator at once)"""
+    """also lower a simulated robot (default: stop the simulator at once)"""
     wait: Duration = 60.0
-    """once it is down, how long its weight may take to be taken, s"""
+    """timeout for a hoist or stand to take the weight of the lowered robot, s"""
     keep_stops: bool = False
     """keep an emergency stop in force for the next `xrl up --disarmed`"""
 
 
 def run(flags: DownFlags) -> int:
-    """Lower the robot, then stop every service, also without a supervisor; keep the logs.
+    """Lower the robot, then stop every service, even without a supervisor; keep the logs.
 
-    Then store where the joints rest, which `xrl drive zero --resume` goes by.
+    Then store where the joints rest, for `xrl drive zero --resume`.
     """
     fleet = SupervisedFleet(flags.run_dir)
     manifest = fleet.run.read_manifest()
@@ -51,7 +51,9 @@ def run(flags: DownFlags) -> int:
     if not flags.limp:
         _lower(fleet, flags)
     if flags.lower_only:
-        print("nothing bears on its legs" if was_up else f"no fleet was up in {fleet.run.path}")
+        print(
+            "the robot's legs bear no weight" if was_up else f"no fleet was up in {fleet.run.path}"
+        )
         return 0
     fleet.stop(keep_logs=True, keep_stops=flags.keep_stops)
     if was_up:
@@ -65,7 +67,7 @@ def run(flags: DownFlags) -> int:
 
 
 def _lower(fleet: SupervisedFleet, flags: DownFlags) -> None:
-    """Lower the robot, if a service here holds a drive of it."""
+    """Lower the robot if a service in this run directory holds one of its drives."""
     running = procfs.service_pids(fleet.run.path)
     simulated = "simulator" in running
     if not {*running} & {*MODULES} or (simulated and not (flags.sit or flags.lower_only)):
@@ -73,8 +75,8 @@ def _lower(fleet: SupervisedFleet, flags: DownFlags) -> None:
     manifest = fleet.run.read_manifest()
     if manifest is None:
         raise FleetError(
-            f"{fleet.run.path}: the fleet's files are gone, so nobody knows whether the robot "
-            f"bears weight: {WAYS}"
+            f"{fleet.run.path}: the fleet's files are missing, so it is unknown whether the robot "
+            f"bears weight; {WAYS}"
         )
     robot = manifest.robot()
     lower(robot, fleet.run.path, partial(print, flush=True), wait_s=flags.wait, simulated=simulated)

@@ -1,4 +1,4 @@
-"""`xrl estop` and `xrl pendant`: every module to DAMP, now or once a dead man's handle ends."""
+"""`xrl estop` and `xrl pendant`: set every module to DAMP, now or when a dead man's handle ends."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from tools.terminal import Console
 
 EVERY_S: Final = 0.02
 LINKS_S: Final = 2.0
-"""Time that the links may take to come up before a silent module is reported, s."""
+"""Time for the links to come up before silent modules are reported, s."""
 OTHER_S: Final = 0.2
-"""Wait in which another pendant's beats would show, s."""
+"""Time to watch for the heartbeats of another pendant, s."""
 
 
 EXAMPLES: Final = """
@@ -39,29 +39,31 @@ xrl estop
 xrl estop --run-dir /tmp/lab
 xrl estop --local                       # on the robot's own host: needs no bus
 xrl estop --config lab.toml             # from another computer, with an operator's key
-xrl estop --config lab.toml --wait      # open the links now; Enter or Ctrl-C is the stop
+xrl estop --config lab.toml --wait      # open the links now, and stop on Enter or Ctrl-C
 xrl pendant               # Enter lays it down without a stop; Ctrl-C stops every module
-xrl pendant --for 600     # lays itself down after ten minutes
+xrl pendant --for 600     # lay it down after ten minutes
 """
 
 
 class EstopFlags(Flags):
-    """Which robot, and by which way."""
+    """Robot to stop, and the way to reach it."""
 
     run_dir: Annotated[Path, parsed(Path, "DIR")] = dataclasses.field(
-        default_factory=default_run_dir  # of any user: whoever can reach the robot may stop it
+        default_factory=default_run_dir  # of any user: anyone who can reach the robot may stop it
     )
-    """run directory: names the fleet and holds its logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID
-    of the user)"""
+    """run directory, which identifies the fleet and holds its logs (default: $XRL_RUN_DIR, else
+    /tmp/xrl-UID)"""
     local: bool = False
-    """only by shared memory, to the joint services on this host (default: both ways)"""
+    """stop only the joint services on this host, through shared memory (default: also over the
+    bus)"""
     partly: Annotated[
         tuple[str, ...] | None, parsed(names_of(MODULES), "MODULE,...", is_one=True)
     ] = None
-    """with --local: only these have to stop, the others are on other hosts (default: all)"""
+    """with --local: only these modules must stop, because the others are on other hosts (default:
+    all)"""
     wait: bool = False
-    """open the links now, say whether all six modules are heard, and stop at Enter, Ctrl-C or the
-    terminal's end; q and Enter leaves without a stop"""
+    """open the links now, report whether all six modules respond, and stop on Enter, Ctrl-C or
+    when the terminal closes; q and Enter quits without a stop"""
     config: Annotated[
         Path | None,
         Arg(
@@ -71,16 +73,16 @@ class EstopFlags(Flags):
     ] = None
 
     def check(self) -> None:
-        """Refuse what goes with one way only."""
+        """Refuse flags that do not apply to the chosen way."""
         super().check()
         if self.partly and not self.local:
-            raise FleetError("--partly goes with --local: over the bus all six must stop")
+            raise FleetError("--partly needs --local: over the bus all six modules must stop")
         if self.wait and self.local:
-            raise FleetError("--wait is for the bus; `xrl pendant` waits by shared memory")
+            raise FleetError("--wait needs the bus; remove --local, or use `xrl pendant`")
 
 
 def estop(flags: EstopFlags) -> int:
-    """Repeat the stop until every module has stopped; only a restart leaves DAMP."""
+    """Repeat the stop until every module has stopped; a module leaves DAMP only by a restart."""
     run_dir = flags.run_dir
     is_here = _is_here(flags)
     if flags.wait:
@@ -91,7 +93,10 @@ def estop(flags: EstopFlags) -> int:
     wanted = flags.partly or MODULES
     if flags.local:
         if not here:
-            raise FleetError(f"{run_dir}: no joint service of this robot is on this host")
+            raise FleetError(
+                f"{run_dir}: no joint service of this robot is on this host; remove --local, or "
+                "run this on the robot's host"
+            )
         going = wait_here(run_dir, here, wanted)
     else:
         try:
@@ -99,14 +104,14 @@ def estop(flags: EstopFlags) -> int:
         except XrlError as error:
             if not here:
                 raise
-            print(f"xrl: not over the bus: {error}", file=sys.stderr)
+            print(f"xrl: cannot stop over the bus: {error}", file=sys.stderr)
             going = wait_here(run_dir, here)
     _conclude(going, ", ".join(flags.partly) if flags.partly else "all six modules")
     return 0
 
 
 def _is_here(flags: EstopFlags) -> bool:
-    """Return True if the run directory is of the robot that is meant: any, if none was named."""
+    """Return True if the run directory is of the robot given by --config, or none was given."""
     if flags.config is None:
         return True
     manifest = RunDir(flags.run_dir).read_manifest()
@@ -114,24 +119,24 @@ def _is_here(flags: EstopFlags) -> bool:
 
 
 def _robot(flags: EstopFlags) -> RobotConfig:
-    """Return the robot that is asked for, or whose fleet is up."""
+    """Return the requested robot, or the one whose fleet is up."""
     if flags.config is not None:
         return load(flags.config)
     manifest = RunDir(flags.run_dir).read_manifest()  # whether or not its supervisor lives
     if manifest is not None:
         return manifest.robot()
-    if places.robot_file_here() is None:  # a stop of the shipped robot would be heard by nobody
-        raise FleetError(f"no fleet is up in {flags.run_dir}; name its robot file with --config")
+    if places.robot_file_here() is None:  # no module would receive a stop for the shipped robot
+        raise FleetError(f"no fleet is up in {flags.run_dir}; give its robot file with --config")
     return load(places.robot_file())
 
 
 def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
-    """Keep the links open until a person asks for the stop, or leaves."""
+    """Keep the links open until a person requests the stop or quits."""
     require_operator(robot, "estop")
     console, asked = Console(), StopFlag(signal.SIGHUP)
     with open_session(robot, "estop", run_dir) as session:
         stop = BusStop(robot, session, run_dir if here else None)
-        console.print("Enter, Ctrl-C, or this terminal's end stops all modules; q and Enter leaves")
+        console.print("Enter, Ctrl-C or closing this terminal stops all modules; q and Enter quits")
         told: list[str] | None = None
         since_s = time.monotonic()
         typed = None
@@ -141,10 +146,10 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
                 silent = stop.listen()
                 if silent != told and time.monotonic() - since_s > LINKS_S:
                     told = silent
-                    words = f"not heard: {', '.join(silent)}" if silent else "all six heard"
+                    words = f"silent: {', '.join(silent)}" if silent else "all six modules respond"
                     console.print(words, style="bold red" if silent else None)
         if not asked and typed is not None and typed.strip().lower() == "q":
-            console.print("left without a stop")
+            console.print("quit without a stop")
             return 0
         if here:
             request_here(run_dir)
@@ -156,20 +161,20 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
 def _conclude(going: list[str], which: str) -> None:
     refuse_going(going)
     Console().print(
-        f"{which} are stopped: DAMP. The robot sinks slowly, or holds beside a limp or dead "
-        "module; `xrl rearm` or `xrl down` ends it"
+        f"{which} are stopped (DAMP). The robot sinks slowly; modules beside a limp or dead one "
+        "hold. To end the stop, run `xrl rearm` or `xrl down`"
     )
 
 
 class PendantFlags(RunDirFlags):
-    """How long."""
+    """Duration of the pendant."""
 
     for_s: Annotated[Duration | None, option("--for")] = None
-    """lay it down after S seconds"""
+    """lay the pendant down after S seconds"""
 
 
 def pendant(flags: PendantFlags) -> int:
-    """Beat until it is laid down; 0 then, and after a stop that reached this host's modules."""
+    """Send heartbeats until the pendant is laid down or stops the modules; return 0 for either."""
     try:
         handle = Pendant(flags.run_dir, MODULES)
     except OSError as error:
@@ -177,16 +182,19 @@ def pendant(flags: PendantFlags) -> int:
             f"{flags.run_dir}: no shared memory for the pendant: {error.strerror}"
         ) from None
     if not handle.modules:
-        raise FleetError(f"{flags.run_dir}: no joint service of a fleet is on this host")
+        raise FleetError(
+            f"{flags.run_dir}: no joint service of a fleet is on this host; run this on the "
+            "robot's host, after `xrl up`"
+        )
     before = handle.beats
     time.sleep(OTHER_S)
     if handle.beats != before:
-        raise FleetError("another pendant is held: lay that one down first")
+        raise FleetError("another pendant is active; lay it down first")
     console, stop = Console(), StopFlag(signal.SIGHUP)
     elsewhere = [module for module in MODULES if module not in handle.modules]
     if elsewhere:
-        console.print(f"does not stop {', '.join(elsewhere)}: they have no service on this host")
-    console.print("held: Enter lays it down; Ctrl-C, or this program's end, stops all modules")
+        console.print(f"this pendant does not stop {', '.join(elsewhere)}: no service on this host")
+    console.print("held: Enter lays it down; Ctrl-C or the end of this program stops all modules")
     ends = None if flags.for_s is None else time.monotonic() + flags.for_s
     shown = None
     while not stop and shown != "":
@@ -196,7 +204,7 @@ def pendant(flags: PendantFlags) -> int:
             handle.lay_down()
             console.print("laid down: the robot continues without it")
             return 0
-    request_here(flags.run_dir)  # faster than the pendant's silence
+    request_here(flags.run_dir)  # faster than the pendant's timeout
     going = wait_here(flags.run_dir, list(handle.modules), handle.modules)
     _conclude(going, f"{len(handle.modules)} modules")
     return 0

@@ -1,4 +1,4 @@
-"""`xrl faults`: what goes wrong, what then happens, and the way out of it."""
+"""`xrl faults`: lists faults, their effects and how to recover."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _LABEL_WIDTH = 12
 EXAMPLES: Final = """
 xrl faults
 xrl faults --json
-xrl sim --fault knee_left:encoder@4     # to see one
+xrl sim --fault knee_left:encoder@4     # reproduce one
 """
 
 
 class _FaultSection(NamedTuple):
-    """A table of faults, for a terminal and for a page."""
+    """Table of faults for the terminal and the reference page."""
 
     title: str
     about: str
     headings: tuple[str, ...]
     rows: list[tuple[str, ...]]
-    """Name first."""
+    """Cells, beginning with the name."""
 
 
 class FaultsFlags(ConfigFlags):
-    """Whose limits, and in which form."""
+    """Robot whose limits are shown, and the output format."""
 
     json: bool = False
     """print the table as JSON"""
@@ -63,7 +63,7 @@ def run(flags: FaultsFlags) -> int:
         console.print(marked("\n[bold]{}.[/] {}\n", title, " ".join(about.split())))
         for name, *cells in found:
             console.print(marked("[bold]{}[/]", name))
-            grid = Table.grid(padding=(0, 1))  # a label, and its text wrapped under itself
+            grid = Table.grid(padding=(0, 1))  # labels, and texts that wrap in their own column
             grid.add_column(width=_LABEL_WIDTH, justify="right", style="dim")
             grid.add_column()
             for label, cell in zip(headings[1:], cells, strict=True):
@@ -75,13 +75,13 @@ def run(flags: FaultsFlags) -> int:
 def sections(limits: TripsConfig) -> Iterator[_FaultSection]:
     """Yield the faults of drives, the losses and the trips."""
     yield _FaultSection(
-        "A fault of a drive",
+        "Drive faults",
         """\
 The module goes to FAULT and the planner holds the other five. An axis that disarms floats; its
 sibling keeps its torque until the service idles it, at once. Nothing is re-armed automatically: a
-person removes the cause, then restarts the module's service (`xrl kill MODULE`). To see one:
-`xrl sim --fault knee_left:encoder@4`.""",
-        ("fault", "it is", "the drive", "limp", "zero lost", "cause", "you do"),
+person removes the cause, then restarts the module's service (`xrl kill MODULE`). To reproduce a
+fault: `xrl sim --fault knee_left:encoder@4`.""",
+        ("fault", "meaning", "drive", "limp", "zero lost", "cause", "what to do"),
         [
             (
                 kind, FAULT_KINDS[kind].about, row.drive, "yes" if row.limp else "no",
@@ -94,7 +94,7 @@ person removes the cause, then restarts the module's service (`xrl kill MODULE`)
     yield _FaultSection(
         "A lost process or link, and the emergency stop",
         "A joint service holds its module while the planner or its link is gone.",
-        ("lost", "module", "others", "you see", "it ends"),
+        ("lost", "module", "others", "you see", "recovery"),
         [(name, *loss) for name, loss in LOSSES.items()],
     )
     trips = [(cause.name, "the module", row) for cause, row in JOINT_TRIPS.items()]
@@ -102,10 +102,10 @@ person removes the cause, then restarts the module's service (`xrl kill MODULE`)
     yield _FaultSection(
         "Trips",
         """\
-A trip takes the robot out of being led: a module, or the planner, notices that a quantity is beyond
-its limit, and all six modules go to HOLD. The planner leads again after a wait that grows with each
-trip. Limits are those of `[trips]` in the robot file.""",
-        ("trip", "noticed by", "measured", "limit", "you do"),
+A trip stops the robot from being led: a module or the planner detects that a quantity is beyond its
+limit, and all six modules go to HOLD. The planner leads again after a wait that grows with each
+trip. The limits are in `[trips]` of the robot file.""",
+        ("trip", "detected by", "measured", "limit", "what to do"),
         [
             (name, by, row.measured, _limit(row, getattr(limits, row.key)), row.recovery)
             for name, by, row in trips

@@ -1,4 +1,4 @@
-"""`xrl gains`: compute the certified gain schedule of a robot, or say whether it fits."""
+"""`xrl gains`: computes the certified gain schedule of a robot, or checks whether it fits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tools.lab.design.dynamic_certificate import (
 from tools.terminal import Console
 
 ROOM_EVERY = 5
-"""Every n-th pose is judged for what is printed."""
+"""The printed figures are computed at every n-th pose."""
 SHOWN = 6
 """Heights in the printed table."""
 
@@ -38,9 +38,9 @@ SHOWN = 6
 STIFFNESS_ROWS = (
     ("theta_max", "rad", "largest lean the ankles' torque can hold"),
     ("theta_edge", "rad", "lean with the COM over the sole's edge"),
-    ("tau_edge", "N m", "each ankle's torque there"),
-    ("K_ank_min", "N m/rad", "least stiffness of each ankle"),
-    ("K_min", "N/m", "least stiffness of the body"),
+    ("tau_edge", "N m", "torque of each ankle at that lean"),
+    ("K_ank_min", "N m/rad", "minimum stiffness of each ankle"),
+    ("K_min", "N/m", "minimum stiffness of the body"),
     ("K_tau_max", "N/m", "stiffness that gives tau_max at the edge"),
 )
 
@@ -54,19 +54,19 @@ xrl gains --stiffness
 
 
 class GainsFlags(ConfigFlags):
-    """Whose schedule, and what is done with it."""
+    """Robot of the schedule, and whether to compute or check it."""
 
     damping_of: Path | None = None
     """take damping and coupling from another schedule, such as deploy/robot.gains.json, and check
-    them with the dynamic certificate; without it the verb searches for them (two minutes)"""
+    them with the dynamic certificate; without this flag, search for them (two minutes)"""
     check_only: Annotated[bool, option("--check", exclusive="only")] = False
-    """only say whether the schedule fits the robot"""
+    """only check whether the schedule fits the robot"""
     stiffness: Annotated[bool, Arg(exclusive="only")] = False
-    """only print how stiff the body must be to balance (paper section IV)"""
+    """only print the stiffness that the body needs to balance (paper section IV)"""
 
 
 def run(flags: GainsFlags) -> int:
-    """Write the schedule beside the robot file; with --check only say if it would have to be."""
+    """Write the schedule beside the robot file; with --check, only check the existing schedule."""
     robot = config_file.load_without_schedule(flags.config)
     if flags.stiffness:
         return _show_stiffness(robot)
@@ -86,12 +86,12 @@ def run(flags: GainsFlags) -> int:
 
 
 def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None) -> GainSchedule:
-    """Solve the schedule; damping and coupling are searched for, or taken from another."""
+    """Solve the schedule; search for damping and coupling, or take them from another schedule."""
     design = None
     if damping_of is not None:
         other = gain_schedule.read(damping_of)
         if other is None:
-            raise ConfigError(str(damping_of), "(file)", "not found", "a schedule by `xrl gains`")
+            raise ConfigError(str(damping_of), "(file)", "not found", "a schedule from `xrl gains`")
         design = split_program.design_of(other)
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
@@ -123,8 +123,8 @@ def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
     _show_damping(robot, schedule, console)
     margins = split_program.smallest_margins(robot, schedule)
     console.print(
-        f"smallest margin, nodes and half way between: {margins.service:.2f} of what is "
-        f"required with the joint services alone, {margins.onboard:.2f} with the drives alone"
+        f"smallest margin at the nodes and halfway between them: {margins.service:.2f} of the "
+        f"required one with the joint services alone, {margins.onboard:.2f} with the drives alone"
     )
 
 
@@ -143,10 +143,10 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
     parked = certificate.worst(design, PARKED)
     console.print(f"least stable while parked: {parked.words()}", soft_wrap=True)
     fades = certificate.sway(design)
-    console.print(f"slowest oscillation while led fades with {-fades:.2f}/s")
+    console.print(f"slowest oscillation while led decays at {-fades:.2f}/s")
     blind = certificate.worst(design, BLIND).growth.rate
     console.print(
-        f"while an encoder is blind, {1e3 * BLIND_S:.0f} ms, a motion grows to at most "
+        f"while an encoder is blind ({1e3 * BLIND_S:.0f} ms), a motion grows to at most "
         f"{math.exp(BLIND_S * blind):.2f} times its size"
     )
 
@@ -166,14 +166,16 @@ def _show_stiffness(robot: RobotConfig) -> int:
     console.print(table)
     edge = math.degrees(design["y"].theta_edge)
     console.print(
-        f"theta_edge along y: {edge:.2f} deg. The paper's numbers are the column y: its "
-        "theta_edge is that of w_foot / 2, though its formula prints l_foot.",
+        f"theta_edge along y: {edge:.2f} deg. The paper's numbers are those in column y: its "
+        "theta_edge uses w_foot / 2, although its formula has l_foot.",
         style="dim",
     )
     for direction, stiffness in zip(design, robot.law.K_p, strict=False):
         least = design[direction].K_min
         word = "above" if stiffness > least else "BELOW"
-        console.print(f"law.K_p along {direction}: {stiffness:g} N/m, {word} {least:.0f} N/m")
+        console.print(
+            f"law.K_p along {direction}: {stiffness:g} N/m, {word} K_min, {least:.0f} N/m"
+        )
     return 0
 
 

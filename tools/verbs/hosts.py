@@ -1,4 +1,4 @@
-"""`xrl hosts`: a robot whose services run on several hosts, as one thing."""
+"""`xrl hosts`: operates a robot whose services run on several hosts."""
 
 from __future__ import annotations
 
@@ -28,63 +28,63 @@ from tools.terminal import Console, marked
 
 DEFAULT_HOSTS: Final = Path("hosts.toml")
 EXAMPLES: Final = """
-xrl hosts files -o out/hosts               # writes what each host will get, to look at
+xrl hosts files -o out/hosts               # write each host's files into a folder, to inspect them
 xrl keys make --hosts hosts.toml           # once: the authority, and a certificate for each service
-xrl hosts update                           # sends the files over ssh
+xrl hosts update                           # send the files over ssh
 xrl hosts check                            # versions, keys, clocks, units
 xrl hosts up
 xrl hosts status
 xrl hosts estop
-xrl hosts down                             # goes down first, and waits until a hoist bears it
-xrl hosts down --limp                      # idles the drives at once: a standing robot falls
+xrl hosts down                             # lower the robot first, and wait until a hoist bears it
+xrl hosts down --limp                      # idle the drives at once: a standing robot falls
 """
 
 
 class HostsFlags(ConfigFlags):
-    """Which hosts."""
+    """Hosts to act on."""
 
     names: Annotated[tuple[str, ...], positional("HOST")] = ()
-    """these only (default: all)"""
+    """only these hosts (default: all)"""
     hosts: Path = DEFAULT_HOSTS
-    """which host runs what"""
+    """hosts file, which lists the services of each host"""
     authority: Folder | None = None
-    """folder of the authority (default: ~/.config/xrl/ROBOT/authority)"""
+    """folder of the certificate authority (default: ~/.config/xrl/ROBOT/authority)"""
 
 
 class FilesFlags(HostsFlags):
-    """Where they go."""
+    """Folder to write to."""
 
     out: Annotated[Path, option("-o", "--out", metavar="DIR")]
-    """folder"""
+    """folder to write to"""
 
 
 class UpdateFlags(HostsFlags):
-    """And when."""
+    """Permission to update while services run."""
 
     while_up: bool = False
-    """update although services run: one that crashes restarts with the new files"""
+    """update even while services run; a service that crashes restarts with the new files"""
 
 
 class HostsUpFlags(HostsFlags):
-    """How they start."""
+    """State in which the drives start."""
 
     disarmed: bool = False
-    """leave drives idle that do not hold"""
+    """leave drives idle, except those that already hold"""
 
 
 class HostsDownFlags(HostsFlags):
-    """What becomes of a robot that bears weight."""
+    """Handling of a robot that bears weight."""
 
     limp: bool = False
-    """idle the drives at once, whatever they bear: a standing robot falls"""
+    """idle the drives at once, under any load: a standing robot falls"""
     wait: Duration = 60.0
-    """once it is down, how long its weight may take to be taken, s"""
+    """timeout for a hoist or stand to take the weight of the lowered robot, s"""
 
 
 class _Given(NamedTuple):
-    """What every order works with.
+    """Inputs of every verb.
 
-    Only what an order needs is read: a stop must not fail for want of a gain schedule.
+    Each verb reads only the files it needs: a stop must not fail because of the gain schedule.
     """
 
     flags: HostsFlags
@@ -93,7 +93,7 @@ class _Given(NamedTuple):
     remotes: list[Remote]
 
     def files(self) -> dict[str, list[HostFile]]:
-        """Return the files of each host by its name; without an authority all but the keys."""
+        """Return each host's files by its name; without an authority, the keys are missing."""
         config = self.flags.config
         gain_schedule.require(self.robot, config)
         try:
@@ -109,7 +109,7 @@ class _Given(NamedTuple):
         }
 
     def authority(self) -> Authority | None:
-        """Return the authority of this robot's keys; None if there is none yet."""
+        """Return the authority of this robot's keys, or None if it does not exist yet."""
         folder = self.flags.authority or authorities.default_folder(self.robot)
         return Authority(folder) if folder.is_dir() else None
 
@@ -121,7 +121,7 @@ def _given(flags: HostsFlags) -> _Given:
 
 
 def files(flags: FilesFlags) -> int:
-    """Write them into a folder."""
+    """Write each host's files into a folder."""
     given = _given(flags)
     out = flags.out
     for remote in given.remotes:
@@ -130,19 +130,19 @@ def files(flags: FilesFlags) -> int:
             try:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             except OSError as error:
-                raise RunError(f"{path.parent}: cannot be made: {error.strerror}") from None
+                raise RunError(f"{path.parent}: cannot be created: {error.strerror}") from None
             write_atomically(path, file.content, private=file.of_service)
         print(f"{out / remote.host.name}: {', '.join(remote.host.services)}")
     if given.authority() is None:
-        print("without keys: there is no authority yet; `xrl keys make --hosts FILE`")
+        print("without keys: there is no authority yet; run `xrl keys make --hosts FILE`")
     return 0
 
 
 def update(flags: UpdateFlags) -> int:
-    """Bring each host its files."""
+    """Send each host its files."""
     given = _given(flags)
     if given.authority() is None:
-        raise RunError("there is no authority yet; `xrl keys make --hosts FILE` makes one")
+        raise RunError("there is no authority yet; create it with `xrl keys make --hosts FILE`")
     files = given.files()
 
     def one(remote: Remote) -> str:
@@ -153,7 +153,7 @@ def update(flags: UpdateFlags) -> int:
 
 
 def up(flags: HostsUpFlags) -> int:
-    """Start all, look at all, and only then arm: an emergency stop on one host is one for all."""
+    """Start all hosts, check all, and only then arm: a stop on one host holds for all."""
     given = _given(flags)
     failed_to_start = _each(given, running.start)
     if failed_to_start or flags.disarmed:
@@ -166,8 +166,8 @@ def up(flags: HostsUpFlags) -> int:
     stopped = running.stopped_in(statuses.values())
     if stopped:
         who = next((name for name in stopped.values() if name), "somebody")
-        words = f"an emergency stop by {who} holds {', '.join(stopped)}: nothing is armed; "
-        _tell("", FleetError(f"{words}`xrl hosts down`, then `up`, ends it"))
+        words = f"an emergency stop by {who} is in force on {', '.join(stopped)}; no drive was "
+        _tell("", FleetError(f"{words}armed. To end it, run `xrl hosts down`, then `xrl hosts up`"))
     if failed or stopped:
         return FAULT_EXIT_CODE
     return _each(given, lambda r: running.arm(given.hosts, r, statuses[r.host.name]))
@@ -178,12 +178,12 @@ def estop(flags: HostsFlags) -> int:
     given = _given(flags)
     failed = _each(given, lambda remote: running.estop(given.hosts, remote))
     if failed:
-        Console().print(marked("[bold red]not all have stopped: cut the power[/]"))
+        Console().print(marked("[bold red]not all modules have stopped: cut the power[/]"))
     return failed
 
 
 def down(flags: HostsDownFlags) -> int:
-    """Lower the robot, whose legs may be several hosts', then stop all services."""
+    """Lower the robot, whose legs may be on several hosts, then stop all services."""
     given = _given(flags)
     if not flags.limp:
         everyone = [Remote(given.hosts, host) for host in given.hosts.host]
@@ -192,7 +192,7 @@ def down(flags: HostsDownFlags) -> int:
 
 
 def status(flags: HostsFlags) -> int:
-    """Show one table."""
+    """Show the services of all hosts in one table."""
     given = _given(flags)
     found = on_all(given.remotes, lambda remote: running.status(given.hosts, remote))
     good = {name: one for name, one in found.items() if not isinstance(one, FleetError)}
@@ -205,7 +205,7 @@ def status(flags: HostsFlags) -> int:
 
 
 def check(flags: HostsFlags) -> int:
-    """Look; a fault if one is not as it should be."""
+    """Check all hosts; return the exit code of a fault if one is not as it should be."""
     given = _given(flags)
     files = given.files()
     found = on_all(
@@ -225,7 +225,7 @@ def check(flags: HostsFlags) -> int:
 
 
 def _each(given: _Given, work: Callable[[Remote], str]) -> int:
-    """Do the same on all hosts, and say of each how it went as soon as it has; 0 if all did it."""
+    """Do the same on all hosts and print each result at once; return 0 if all succeeded."""
     found = on_all(given.remotes, work, _tell)
     failed = any(isinstance(result, FleetError) for result in found.values())
     return FAULT_EXIT_CODE if failed else 0

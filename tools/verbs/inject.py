@@ -1,4 +1,4 @@
-"""`xrl inject`: make the network of a live fleet bad, on purpose and for a while."""
+"""`xrl inject`: impairs the network of a live fleet."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from tools.fleet.proxy_client import ProxyClient
 from tools.live.describe_inject import check_link, parse_inject
 from tools.terminal import Console
 
-RULE: Final = "of several on one link, a partition applies first, else the one that began last"
+RULE: Final = "if a link has several impairments, a partition applies, else the one that began last"
 
 ABOUT: Final = f"""
 LINK is {", ".join(GROUPS)}, or one direction, such as 'planner->ankle_left',
-'knee_right->planner', 'harness->planner'. What happens to every message on it:
+'knee_right->planner', 'harness->planner'. These apply to every message on it:
   delay=TIME         30, 30ms, 0.03s or 500us
-  jitter=TIME        half the width if uniform, else the standard deviation; a message that this
-                     would deliver before it is sent has no delay
+  jitter=TIME        half the width if uniform, else the standard deviation; a message whose delay
+                     would be negative has no delay
   distribution=KIND  of the jitter: uniform (default), normal, pareto
-  loss=SHARE         a probability, 0.2 or 20%; 1 is all, and not 1%
+  loss=SHARE         probability of loss, 0.2 or 20%; 1 means every message, not 1%
   burst=N            mean number of losses in a row (1)
-  duplicate=SHARE    messages that arrive twice
-  reorder=SHARE      messages without delay
-  rate=BYTES         bytes (not bits) a second on the line
-  partition          nothing passes
+  duplicate=SHARE    share of messages that arrive twice
+  reorder=SHARE      share of messages without delay
+  rate=BYTES         capacity of the link, bytes (not bits) per second
+  partition          no message passes
   ordered            behave like a stream: a late message delays those behind it, and a partition
-                     holds all back until its end; loss still loses messages, and nothing is resent.
-                     Without it the link behaves like datagrams: an overtaken message, or one in a
-                     partition, is lost
+                     holds messages back until it ends; loss still loses messages, and nothing is
+                     resent. Without `ordered` the link behaves like datagrams: a message that is
+                     overtaken or meets a partition is lost
   at=T, for=T        start in T seconds from now (0); duration (until --clear, or the fleet's end)
-A message here is a batch of Zenoh's: messages sent together travel, and are lost, together.
+A message here is a Zenoh batch: messages sent together travel together and are lost together.
 {RULE[0].upper()}{RULE[1:]};
 when that ends, the others apply again.
 """
 EXAMPLES: Final = """
-xrl up --injectable                                       # first
+xrl up --injectable                                       # needed first
 xrl inject 'planner->joints delay=30ms jitter=10ms for=4' # same words as --inject of demo and sim
 xrl inject 'all loss=20% burst=5'
 xrl inject 'planner->left partition ordered at=2 for=1'
@@ -61,16 +61,16 @@ def _link(text: str) -> str:
 
 
 class InjectFlags(RunDirFlags):
-    """An impairment, or those that there are."""
+    """Impairment to start, list or end."""
 
     words: Annotated[
         Inject | None, positional("'LINK KEY=VALUE ...'", parse=parse_inject, one_of="what")
     ] = None
-    """a link, and what is done to it"""
+    """link and its impairment"""
     list: Annotated[bool, Arg(one_of="what")] = False
     """list active and planned impairments"""
     clear: Annotated[str | None, parsed(_link, "LINK", one_of="what")] = None
-    """end every impairment that touches the link, in all of its directions"""
+    """end every impairment that affects the link, in all its directions"""
 
 
 def run(flags: InjectFlags) -> int:
@@ -101,10 +101,10 @@ def _clear(client: ProxyClient, link: str, console: Console) -> None:
 def show(asked: Sequence[RequestedImpairment], console: Console) -> None:
     """Print active and planned impairments, the newest last."""
     if not asked:
-        console.print("nothing is done to any link")
+        console.print("no link is impaired")
         return
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("link", "what", "in force", "for", "passed", "lost"):
+    for heading in ("link", "impairment", "in force", "for", "passed", "lost"):
         table.add_column(heading, justify="right" if heading in ("passed", "lost") else "left")
     for row in asked:
         left = "until --clear"

@@ -35,25 +35,25 @@ from tools.terminal import Console
 
 EXAMPLES: Final = """
 xrl keys make --config lab.toml                       # once, on the computer that keeps the keys
-xrl keys make --hosts hosts.toml                      # ... of a robot on several hosts
+xrl keys make --hosts hosts.toml                      # ... for a robot on several hosts
 xrl keys pack planner harness recorder operator -o body.keys.tar
-xrl keys pack --install                               # all, onto this host
-xrl keys check                                        # this host's keys
+xrl keys pack --install                               # install all on this host
+xrl keys check                                        # check this host's keys
 xrl keys renew --all                                  # before they expire
-xrl keys revoke operator                              # a laptop is lost
+xrl keys revoke operator                              # after a laptop was lost
 """
 
 
 class KeysFlags(ConfigFlags):
-    """Whose keys."""
+    """Robot and authority of the keys."""
 
     hosts: Path | None = None
     """take the services' addresses from this hosts file (default: from the robot file)"""
     authority: Folder | None = None
-    """folder of the authority (default: ~/.config/xrl/ROBOT/authority)"""
+    """folder of the certificate authority (default: ~/.config/xrl/ROBOT/authority)"""
 
     def robot(self) -> RobotConfig:
-        """Return the robot, on its hosts."""
+        """Return the robot, with the addresses of its hosts."""
         robot = config_file.load(self.config)
         if self.hosts is not None:
             robot = robot_on_hosts(robot, hosts_file.load(self.hosts, robot))
@@ -61,32 +61,32 @@ class KeysFlags(ConfigFlags):
 
 
 class MakeFlags(KeysFlags):
-    """How long they are good."""
+    """Lifetime of the certificates."""
 
     days: Annotated[Count, Arg(metavar="DAYS")] = CERTIFICATE_DAYS
     """days until the certificates expire"""
 
 
 class RenewFlags(MakeFlags):
-    """Which."""
+    """Certificates to make again."""
 
     names: Annotated[
         tuple[str, ...],
         positional("NAME", one_of="which", help=", ".join(PRINCIPALS)),
     ] = ()
     all: Annotated[bool, Arg(one_of="which")] = False
-    """all of them"""
+    """all certificates"""
 
 
 class PackFlags(KeysFlags):
-    """Which, and where they go."""
+    """Certificates to pack, and their destination."""
 
     names: Annotated[tuple[str, ...], positional("NAME")] = ()
-    """what runs there; none: everything"""
+    """services and roles of the host (default: all)"""
     out: Annotated[Path | None, option("-o", "--out", metavar="FILE", one_of="out")] = None
-    """a tar file with keys/ in it"""
+    """tar file to write; it contains keys/"""
     install: Annotated[bool, Arg(one_of="out")] = False
-    """this host: write bus.security.keys"""
+    """install on this host, in bus.security.keys"""
 
 
 def make(flags: MakeFlags) -> int:
@@ -94,7 +94,7 @@ def make(flags: MakeFlags) -> int:
     robot = flags.robot()
     authority = new_authority(_authority_folder(flags, robot), robot, flags.days)
     print(f"{authority.folder}: authority of {robot.name!r}, {_count(authority.names.generations)}")
-    print("keep authority.key here; `xrl keys pack NAME ... -o FILE` packs what a host needs")
+    print("keep authority.key here; `xrl keys pack NAME ... -o FILE` packs the keys of a host")
     return 0
 
 
@@ -111,13 +111,13 @@ def pack(flags: PackFlags) -> int:
         return 0
     write_atomically(flags.out, to_tar(files), private=True)
     folder = Path(filled(robot.bus.security.keys, {ROBOT: robot.name})).parent
-    print(f"{flags.out}: {_count(names)}; on that host:")
+    print(f"{flags.out}: {_count(names)}; on that host, run:")
     print(f"mkdir -p {folder} && tar -xf {flags.out.name} -C {folder}")
     return 0
 
 
 def check(flags: KeysFlags) -> int:
-    """Look at this host's keys, or at the authority's."""
+    """Check this host's keys, or the authority's."""
     robot = flags.robot()
     folder = keys_folder(robot) if flags.authority is None else flags.authority
     rows = inspect_keys(folder, robot)
@@ -130,7 +130,7 @@ def renew(flags: RenewFlags) -> int:
     robot = flags.robot()
     authority, names = _named(flags, robot)
     authority.renew(robot, names, flags.days)
-    print(f"{authority.folder}: {_count(names)} renewed; pack them for their hosts, one by one")
+    print(f"{authority.folder}: {_count(names)} renewed; pack them for each of their hosts")
     return 0
 
 
@@ -141,8 +141,10 @@ def revoke(flags: RenewFlags) -> int:
     authority.revoke(robot, names, flags.days)
     current = ", ".join(f"{name}.{authority.names.generations[name]}" for name in names)
     print(f"{authority.folder}: now {current}")
-    print("pack for ALL hosts (or `xrl hosts update`) and restart the fleet; until then it lets")
-    print("the old ones in")
+    print(
+        "pack the keys of ALL hosts (or run `xrl hosts update`) and restart the fleet; until then"
+    )
+    print("it accepts the old certificates")
     return 0
 
 
@@ -153,8 +155,10 @@ def _authority_folder(flags: KeysFlags, robot: RobotConfig) -> Path:
 def _opened(flags: KeysFlags, robot: RobotConfig) -> Authority:
     authority = Authority(_authority_folder(flags, robot))
     if authority.names.robot != robot.name:
-        right = f"give that of {robot.name!r} by --authority"
-        raise BusError(f"{authority.folder}: authority of {authority.names.robot!r}; {right}")
+        right = f"give that of {robot.name!r} with --authority"
+        raise BusError(
+            f"{authority.folder}: is the authority of {authority.names.robot!r}; {right}"
+        )
     return authority
 
 
@@ -163,7 +167,7 @@ def _named(flags: RenewFlags, robot: RobotConfig) -> tuple[Authority, Sequence[s
     names = principals_of(robot) if flags.all else flags.names
     for name in names:
         if name not in principals_of(robot):
-            raise BusError(f"{name!r}: no such name; one of {', '.join(principals_of(robot))}")
+            raise BusError(f"{name!r}: must be one of {', '.join(principals_of(robot))}")
     return authority, names
 
 
@@ -173,7 +177,7 @@ def _count(names: Sized) -> str:
 
 def _table(folder: Path, rows: list[KeyRow]) -> Table:
     table = Table(title=str(folder), title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("name", "from", "expires", "dialled as", ""):
+    for heading in ("name", "from", "expires", "host names", ""):
         table.add_column(heading, no_wrap=heading != "")
     for row in rows:
         words = Text(row.wrong, "bold red") if row.wrong else Text(row.warning, "yellow")

@@ -1,4 +1,4 @@
-"""`xrl lead`: lead height, pitch and assist by a gamepad or by keys."""
+"""`xrl lead`: leads height, pitch and assist with a gamepad or the keyboard."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 
 PERIOD_S: Final = 0.05
-"""Repeats each request: an intent fades out, and a push ends, once nobody repeats it."""
+"""Period of each request, s: an intent fades out, and a push ends, unless it is repeated."""
 LINKS_S: Final = 3.0
 SETTLE_S: Final = 60.0
-"""Longest wait for a person to let go of the sticks and to press the dead man's button once."""
+"""Timeout for releasing the sticks and pressing the dead man's button once, s."""
 KEY_HELD_S: Final = 0.1
-"""A press of a key is a full deflection for the time since the last look, and no longer than so."""
+"""A key press is a full deflection for the time since the last poll, at most this time, s."""
 
 
 class Key(Enum):
-    """A key that means something: its deflection."""
+    """Keys with a function, and their deflections."""
 
     UP = (1.0, 0.0, 0.0)
     DOWN = (-1.0, 0.0, 0.0)
@@ -60,29 +60,30 @@ KEYS: Final = {
 
 
 EXAMPLES: Final = """
-xrl lead                 # the first gamepad: hold the right shoulder and move the sticks
+xrl lead                 # the first gamepad: hold the right shoulder button and move the sticks
 xrl lead --keys          # arrows: height and pitch; +, -: assist; o: unpark; space: stop
 xrl lead --pad Xbox --hold leftshoulder --stop x
 """
 
 
 class LeadFlags(RunDirFlags):
-    """By what the robot is led."""
+    """Device that leads the robot."""
 
     keys: Annotated[bool, Arg(exclusive="by")] = False
-    """lead by the keys of this terminal, not a gamepad"""
+    """lead with the keyboard of this terminal, not a gamepad"""
     pad: Annotated[str | None, Arg(metavar="NAME", exclusive="by")] = None
-    """part of the pad's name or path, such as Xbox or /dev/input/event7 (default: the first pad)"""
+    """part of the gamepad's name or path, such as Xbox or /dev/input/event7 (default: the first
+    one)"""
     hold: Annotated[str, Arg(choices=BUTTONS)] = "rightshoulder"
     """dead man's button"""
     stop: Annotated[str, Arg(choices=BUTTONS)] = "b"
-    """emergency stop"""
+    """emergency stop button"""
 
     def check(self) -> None:
-        """Refuse what goes with another way of leading."""
+        """Refuse the same button for both functions."""
         super().check()
         if self.hold == self.stop:
-            raise FleetError(f"--hold and --stop are both {self.hold}; give two buttons")
+            raise FleetError(f"--hold and --stop are both {self.hold}; give two different buttons")
 
 
 def run(flags: LeadFlags) -> int:
@@ -98,21 +99,23 @@ def run(flags: LeadFlags) -> int:
         leader = _Leader(robot, session, simulated="simulator" in fleet.manifest.services)
         ended = _by_pad(pad, leader, console) if pad is not None else _by_keys(leader, console)
         if ended is not Key.STOP:
-            console.print(f"let go: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
+            console.print(f"ended: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
             if pad is not None and pad.gone:
-                raise FleetError(f"{pad.name}: lost: unplugged, or out of its receiver's range")
+                raise FleetError(
+                    f"{pad.name}: lost; plug it in, or bring it into its receiver's range"
+                )
             return 0
         request_here(fleet.run.path)
         refuse_going(BusStop(robot, session, fleet.run.path).stop())
-    console.print("stopped: DAMP. It sinks slowly; `xrl status` names the way out")
+    console.print("stopped (DAMP). The robot sinks slowly; `xrl status` says how to recover")
     return 0
 
 
 class _Leader:
-    """Sends where a person leads."""
+    """Sends the motion and assist that a person requests."""
 
     def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
-        """Begin where the robot is."""
+        """Start at the robot's present height and pitch."""
         self._hand = session.publisher(topics.OPERATOR_HAND, HandLead) if simulated else None
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
@@ -123,7 +126,7 @@ class _Leader:
         while (truth is None and simulated) or self._newest() is None:
             truth = truths.take() or truth
             if time.monotonic() > deadline:
-                raise FleetError("the robot is silent; see `xrl status`")
+                raise FleetError("no message from the robot; see `xrl status`")
             time.sleep(0.01)
         height, pitch = (truth.torso[2], truth.angles[1]) if truth is not None else (1.0, 0.0)
         self.pilot = Pilot(height, pitch, robot.assist.force_max)
@@ -131,17 +134,17 @@ class _Leader:
         self._sent = 0
 
     def take_hold(self) -> None:
-        """Begin to lead again: with the assist that is given now, not with that of before."""
+        """Resume leading, with the assist that is given now instead of the one requested before."""
         status = self._newest()
         self.pilot.limit_assist(0.0 if status is None else status.assist_n)
 
     @property
     def other(self) -> str:
-        """Who else asks for assist now; "" for nobody."""
+        """Name of another sender that requests assist now, or ""."""
         return other_asker(self._newest(), self._source)
 
     def lead(self, wanted: Deflection, dt: float) -> None:
-        """Go on by dt, s, and tell the robot; assist only while nobody else asks for it."""
+        """Integrate over dt, s, and send; request assist only while no other sender does."""
         led = self.pilot.integrate(wanted, dt)
         now, self._sent = now_ns(), self._sent + 1
         if self._hand is not None:
@@ -155,7 +158,7 @@ class _Leader:
             self._ask(led.assist_n)
 
     def open(self) -> None:
-        """Ask a parked robot to be led again."""
+        """Request that a parked robot be led again."""
         self._sent += 1
         self._ask(self.pilot.led.assist_n, Park.OPEN)
 
@@ -169,12 +172,12 @@ class _Leader:
             )  # fmt: skip
 
     def describe(self, held: str) -> Text:
-        """Return what is led and what the robot does, as one line."""
+        """Return the request and the robot's response as one line."""
         led: Led = self.pilot.led
         status = self._newest()
         hand = f"height {led.height:.3f} m, pitch {led.pitch:+.2f} rad, " if self._hand else ""
         given = f", given {status.assist_n:.0f} N" if status is not None else ""
-        given += f"; {self.other} asks for assist" if self.other else ""
+        given += f"; {self.other} requests assist" if self.other else ""
         return Text(f"{held}: {hand}assist {led.assist_n:.0f} N{given}")
 
     def _newest(self) -> PlannerStatus | None:
@@ -183,8 +186,8 @@ class _Leader:
 
 
 def _by_pad(pad: Gamepad, leader: _Leader, console: Console) -> Key | None:
-    """Lead by a pad until it is over; STOP if it was the stop."""
-    console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C ends it")
+    """Lead with a gamepad until it ends; return STOP after the emergency stop."""
+    console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C quits")
     settling = time.monotonic() + SETTLE_S
     stop = StopFlag()
     last, held = time.monotonic(), False
@@ -197,7 +200,7 @@ def _by_pad(pad: Gamepad, leader: _Leader, console: Console) -> Key | None:
             if not pad.settled:
                 to_do = pad.settle()
                 if to_do and now > settling:
-                    raise FleetError(f"{pad.name}: not begun within {SETTLE_S:g} s: {to_do}")
+                    raise FleetError(f"{pad.name}: not ready within {SETTLE_S:g} s: {to_do}")
                 shown.update(Text(to_do))
                 last = now
                 continue
@@ -212,13 +215,13 @@ def _by_pad(pad: Gamepad, leader: _Leader, console: Console) -> Key | None:
 
 
 def _by_keys(leader: _Leader, console: Console) -> Key | None:
-    """Lead by keys until it is over; STOP if it was the stop."""
+    """Lead with the keyboard until it ends; return STOP after the emergency stop."""
     stop = StopFlag()
     with Keyboard(KEYS) as keyboard:
         if not keyboard.present:
-            raise FleetError("no terminal to read keys from; a gamepad leads without --keys")
+            raise FleetError("no terminal to read keys from; to lead with a gamepad, remove --keys")
         console.print(
-            "arrows: height and pitch; + and -: assist; o: open; space or x: STOP; q ends it"
+            "arrows: height and pitch; + and -: assist; o: unpark; space or x: STOP; q: quit"
         )
         last = time.monotonic()
         with Live(console=console, refresh_per_second=4, transient=True) as shown:
@@ -235,12 +238,12 @@ def _by_keys(leader: _Leader, console: Console) -> Key | None:
                 last = now
                 shown.update(leader.describe("led"))
         if not keyboard.present:
-            raise HungUpError("the terminal is gone: the hand stays, assist fades out")
+            raise HungUpError("the terminal has closed: the hand stays, assist fades out")
     return None
 
 
 def _deflection_of(presses: Sequence[Key]) -> Deflection:
-    """Return what several keys ask for together; however often one is repeated, at most full."""
+    """Return the combined deflection of several key presses, at most full deflection."""
     parts = [sum(float(press.value[axis]) for press in presses) for axis in range(3)]
     height, pitch, assist = (max(-1.0, min(1.0, part)) for part in parts)
     return Deflection(height, pitch, assist)

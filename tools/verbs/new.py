@@ -1,4 +1,4 @@
-"""`xrl new`: a robot's own directory, to be changed and kept."""
+"""`xrl new`: creates a directory with a robot's files, which the user edits."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tools.flags import Flags, positional
 
 HOSTS_FILE: Final = "hosts.example.toml"
 _ABOUT_PLANTS: Final = (
-    "# How the true robot differs from robot.toml; for the simulator: --plant plants/{}.toml\n"
-    "# Keys that are left out are as in `realistic`, which the simulator takes without --plant.\n"
+    "# Differences of the true robot from robot.toml, for the simulator: --plant plants/{}.toml\n"
+    "# Missing keys are as in `realistic`, the simulator's default without --plant.\n"
 )
 
 
@@ -30,14 +30,14 @@ xrl new .                       # here, if this directory is empty
 
 
 class NewFlags(Flags):
-    """Where."""
+    """Directory to create."""
 
     directory: Annotated[Path, positional("DIR")]
-    """directory; made if absent, else it must be empty"""
+    """directory; created if it does not exist, otherwise it must be empty"""
 
 
 def run(flags: NewFlags) -> int:
-    """Copy the shipped files out, all or none, and say what comes next."""
+    """Copy all shipped files, or none, and print the next steps."""
     with _filled(flags.directory) as scratch:
         for name, content in contents().items():
             path = scratch / name
@@ -48,7 +48,7 @@ def run(flags: NewFlags) -> int:
 
 
 def contents() -> dict[str, bytes]:
-    """Return the files of a robot's directory, by their names in it; the robot file comes last."""
+    """Return the files of a robot's directory by name; the robot file comes last."""
     names = [ROBOT_FILE.replace(".toml", ".gains.json"), HOSTS_FILE]
     copied = [FILES / name for name in names] + sorted(SCENARIOS.glob("*.toml"))
     files = {path.relative_to(FILES).as_posix(): path.read_bytes() for path in copied}
@@ -60,9 +60,9 @@ def contents() -> dict[str, bytes]:
 
 @contextmanager
 def _filled(directory: Path) -> Iterator[Path]:
-    """Yield a folder whose contents become the directory's if the block ends well.
+    """Yield a folder whose contents move into the directory if the block succeeds.
 
-    Otherwise the directory is left as it was found: empty, or absent.
+    Otherwise the directory is left empty or absent, as it was found.
     """
     made = _made(directory)
     moved: list[Path] = []
@@ -82,17 +82,17 @@ def _filled(directory: Path) -> Iterator[Path]:
 
 
 def _made(directory: Path) -> bool:
-    """Make the directory and return True, or return False if it is there and empty."""
+    """Create the directory and return True; return False if it exists and is empty."""
     try:
         directory.mkdir()
     except FileNotFoundError:
-        raise RunError(f"{directory}: {directory.parent} does not exist; make it first") from None
+        raise RunError(f"{directory}: {directory.parent} does not exist; create it first") from None
     except FileExistsError:
         if not directory.is_dir():
-            raise RunError(f"{directory}: not a directory; name a new or an empty one") from None
+            raise RunError(f"{directory}: not a directory; give a new or empty one") from None
         if not any(directory.iterdir()):
             return False
-        right = "nothing in it is replaced; name a new or an empty one"
+        right = "nothing in it is replaced; give a new or empty directory"
         raise RunError(f"{directory}: not empty, and {right}") from None
     return True
 
@@ -100,15 +100,15 @@ def _made(directory: Path) -> bool:
 def _what_next(directory: Path) -> str:
     lines = [
         f"{directory}: {ROBOT_FILE}, its gain schedule, scenarios, plants, {HOSTS_FILE}",
-        "what next:",
+        "next steps:",
         f"  cd {shlex.quote(str(directory))}",
         "  xrl sim                                  # every verb finds robot.toml here",
         "  xrl sim --scenario crawl --plant plants/ideal.toml",
-        "  xrl gains                                # after a change of masses, lengths, limits",
+        "  xrl gains                                # after a change of masses, lengths or limits",
     ]
     if shutil.which("cc"):
         lines += [
-            "to run the law as C, which is faster, run this after each change of robot.toml:",
+            "to compile the law to C, which is faster, run this after each change of robot.toml:",
             f"  {graph_libraries.command()}",
         ]
     return "\n".join(lines)

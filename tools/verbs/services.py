@@ -1,4 +1,4 @@
-"""`xrl kill`, `xrl start` and `xrl rearm`: signals to services, and their next processes."""
+"""`xrl kill`, `xrl start` and `xrl rearm`: signal, start and rearm services."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tools.fleet.rearming import rearm as rearm_all
 from tools.fleet.supervise import SupervisedFleet
 
 EXAMPLES: Final = """
-xrl start planner       # after `xrl up --no-planner`: it leads once all six are ready
+xrl start planner       # after `xrl up --no-planner`: it leads once all six modules are ready
 xrl start knee_left     # at once, even if the supervisor waits after several failures
 xrl kill planner                        # dead at once; the supervisor restarts it
 xrl kill planner --signal STOP          # frozen, like a hung process
@@ -23,28 +23,28 @@ xrl rearm               # once the robot is at rest: all six hold, then the plan
 
 
 class ServiceFlags(RunDirFlags):
-    """Which service."""
+    """Service to act on."""
 
     service: Annotated[str, positional("SERVICE")]
-    """a name that `xrl status` shows"""
+    """name of the service, as shown by `xrl status`"""
 
 
 class KillFlags(ServiceFlags):
-    """And how."""
+    """Signal to send."""
 
     signal: Literal["KILL", "STOP", "CONT", "TERM"] = "KILL"
 
 
 def start(flags: ServiceFlags) -> int:
-    """Start it, or continue it."""
+    """Start or resume a service."""
     fleet = SupervisedFleet.attach(flags.run_dir)
     crash_loop = fleet.crash_loop(flags.service)
     runs = fleet.start_service(flags.service)
     if crash_loop:
-        print(f"{crash_loop}. {'Nothing was done' if runs is not None else 'Started once more'}")
+        print(f"{crash_loop}. {'Nothing was done' if runs is not None else 'Started again'}")
         return FAULT_EXIT_CODE
     if runs is not None:
-        print(f"{flags.service}: runs already, as process {runs}; nothing was done")
+        print(f"{flags.service}: already runs as process {runs}; nothing was done")
     else:
         print(f"{flags.service}: started; `xrl status` shows its state")
     return 0
@@ -54,7 +54,7 @@ def kill(flags: KillFlags) -> int:
     """Send the signal."""
     fleet = SupervisedFleet.attach(flags.run_dir)
     if flags.signal in ("KILL", "TERM") and flags.service in MODULES:
-        fleet.forget(flags.service)  # a person asks for its next process: it may arm the drive
+        fleet.forget(flags.service)  # a person requests the next process, so it may arm the drive
     pid = fleet.kill(flags.service, signal.Signals[f"SIG{flags.signal}"])
     print(f"{flags.service} (pid {pid}): {flags.signal} sent")
     return 0
@@ -63,5 +63,5 @@ def kill(flags: KillFlags) -> int:
 def rearm(flags: RunDirFlags) -> int:
     """End an emergency stop for all six modules together, or for none."""
     taken_s = rearm_all(SupervisedFleet.attach(flags.run_dir))
-    print(f"all six modules hold or track again, after {taken_s:.1f} s; the planner leads next")
+    print(f"all six modules hold or track again after {taken_s:.1f} s; the planner leads next")
     return 0

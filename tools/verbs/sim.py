@@ -1,4 +1,4 @@
-"""`xrl sim`: the experiment in virtual time: no processes, bit-identical, as fast as it can."""
+"""`xrl sim`: runs an experiment in virtual time, in one process, bit-identical and fast."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ xrl sim --delay 50 --control centralised
 xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
 xrl sim --plant ideal
 xrl sim --controller examples/lqr_controller.py
-xrl sim --scenario stand --hand out/view/run.mcap     # as a person led it there
+xrl sim --scenario stand --hand out/view/run.mcap     # repeat how a person led it
 xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
 xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
 """
@@ -49,22 +49,22 @@ class SimFlags(experiment.ExperimentFlags):
     delay: Milliseconds = 1.0
     """delay of every link, each way"""
     jitter: Milliseconds = 0.0
-    """half the width of a uniform spread"""
+    """half the width of a uniform distribution"""
     loss: Annotated[float, Range(0.0, 1.0, ""), Arg(metavar="P")] = 0.0
     """probability that a message is lost"""
     control: Annotated[str, Arg(choices=CONTROLS)] = SHIPPED
-    """where torques are computed; centralised: all in the planner, a baseline to compare with"""
+    """where torques are computed; centralised: all in the planner, as a baseline for comparison"""
     hand: Annotated[Path | None, Arg(metavar="RUN")] = None
     """repeat the hand and pushes of this record (`operator/hand`) instead of the scenario's path"""
     out: Folder | None = None
-    """where results go (default: out/sim-<time>)"""
+    """folder for the results (default: out/sim-<time>)"""
 
     def check(self) -> None:
         """Refuse two controllers."""
         super().check()
         if self.controller is not None and self.control != SHIPPED:
             raise RunError(
-                "--controller and --control: both choose what computes the torques; leave one out"
+                "--controller and --control both choose what computes the torques; remove one"
             )
 
 
@@ -76,7 +76,7 @@ def run(flags: SimFlags) -> int:
     true_plant = plant_from(flags.plant)
     hand = _path_of(flags.hand) if flags.hand is not None else ()
     if flags.controller is not None:
-        controller_maker(flags.controller, robot)  # refused before anything is written
+        controller_maker(flags.controller, robot)  # reject it before anything is written
     network = Impairment(delay_ms=flags.delay, jitter_ms=flags.jitter, loss=flags.loss)
     out = experiment.make_out(flags.out, "sim")
     experiment.introduce(scenario, console)
@@ -98,8 +98,8 @@ def run(flags: SimFlags) -> int:
             )  # fmt: skip
         except KeyboardInterrupt:
             console.print(
-                f"interrupted; what was recorded until then is in {out}, and `xrl log recover` "
-                "finishes its file",
+                f"interrupted; the record up to this point is in {out}; complete its file with "
+                "`xrl log recover`",
                 soft_wrap=True,
             )
             raise
@@ -111,11 +111,15 @@ def run(flags: SimFlags) -> int:
 
 
 def _path_of(record: Path) -> tuple[HandRow, ...]:
-    """Return how the hand was led in a record."""
+    """Return the path of the hand in a record."""
     log = read_run(record)
     path = hand_path(log)
     if not path and log.messages(topics.OPERATOR_HAND):
-        raise RunError(f"{record}: no scenario ran while somebody led; `xrl demo --view` runs one")
+        raise RunError(
+            f"{record}: no scenario ran while the hand was led; record one with `xrl demo --view`"
+        )
     if not path:
-        raise RunError(f"{record}: nobody led the hand there; in `xrl demo --view` a person does")
+        raise RunError(
+            f"{record}: nobody led the hand in it; record a led hand with `xrl demo --view`"
+        )
     return path

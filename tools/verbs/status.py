@@ -1,4 +1,4 @@
-"""`xrl status`: every service and every module; exit code 1 if the robot has fallen."""
+"""`xrl status`: shows every service and module; exit code 1 if the robot has fallen."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ xrl status --json | jq .services.planner
 
 
 class StatusFlags(RunDirFlags):
-    """What is shown, and how often."""
+    """Output format, and whether to refresh it."""
 
     json: Annotated[bool, Arg(exclusive="form")] = False
     """print JSON, in SI units"""
@@ -30,8 +30,8 @@ class StatusFlags(RunDirFlags):
 
 
 def run(flags: StatusFlags) -> int:
-    """Look at the fleet once, or until interrupted."""
-    fleet = SupervisedFleet.attach(flags.run_dir, warn=False)  # it is in the table
+    """Show the fleet once, or until interrupted."""
+    fleet = SupervisedFleet.attach(flags.run_dir, warn=False)  # the table shows it
     robot = fleet.manifest.robot()
     with open_session(robot, "status", fleet.run.path) as session:
         monitors = monitors_of(session, fleet.manifest.topics)

@@ -36,17 +36,17 @@ from tools.live.experiment import (
 from tools.terminal import Console, marked
 
 SETTLE_S = 3.0
-"""A scenario starts so long after the hoist is down."""
+"""Delay between the end of the hoist's descent and the start of the scenario, s."""
 
 
 EXAMPLES: Final = """
 xrl up
 xrl up --scenario crawl --out out/crawl
-xrl up --ros2                                  # ROS 2 sees it: docs/ros2.md
-xrl up --ros2 --domain 7 --accept estop        # and may stop it
+xrl up --ros2                                  # show it to ROS 2: docs/ros2.md
+xrl up --ros2 --domain 7 --accept estop        # and let ROS 2 stop it
 xrl up --injectable                            # then: xrl inject 'all delay=30'
 xrl up --config lab.toml --no-sim
-xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # one host's services
+xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # services of one host
 xrl up --config lab.toml --no-sim --only hip_left,host_recorder         # with a record on this host
 xrl up --config lab.toml --no-sim --disarmed   # from a systemd unit
 xrl up --config lab.toml --no-sim --readonly   # to move the joints by hand and watch
@@ -54,57 +54,57 @@ xrl up --config lab.toml --no-sim --readonly   # to move the joints by hand and 
 
 
 class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
-    """Which services are started, and how."""
+    """Services to start, and how."""
 
     out: Folder | None = None
-    """where the recorder writes (default: out/ and the time)"""
+    """folder for the record (default: out/<time>)"""
     scenario: Annotated[str | None, Arg(metavar="NAME|FILE")] = None
-    """what the simulated operator does once the robot stands: a file, or a name
-    (beside the robot file in scenarios/, or a shipped one; its kills are left to you)"""
+    """scenario of the simulated operator once the robot stands: a file, or the name of a scenario
+    that is shipped or in scenarios/ beside the robot file; do its kills yourself (`xrl kill`)"""
     no_sim: bool = False
-    """start no simulator: the drives are real, or start later"""
+    """start no simulator: the drives are real, or a simulator starts later"""
     only: Annotated[
         tuple[str, ...] | None,
         parsed(names_of(), "SERVICE,...", is_one=True),
     ] = None
-    """start only these: the other services run on other hosts, at their endpoints in the robot
+    """start only these services; the others run on other hosts, at their endpoints in the robot
     file"""
     no_planner: bool = False
     """start no planner: the six modules HOLD; `xrl start planner` starts it later"""
     injectable: bool = False
     """put the network proxy between planner, joints and sensors, for `xrl inject`"""
     disarmed: bool = False
-    """arm no drive until a person asks (xrl kill MODULE), but take over drives that hold; for
-    automatic starts, as after a power cut"""
+    """arm no drive until a person requests it (`xrl kill MODULE`), but take over drives that
+    already hold; for automatic starts, such as after a power cut"""
     ros2: bool = False
     """show the robot to ROS 2 over Zenoh: joint states, transforms, diagnostics (docs/ros2.md)"""
     domain: Annotated[int | None, parsed(rmw.domain, "N")] = None
-    """with --ros2: its domain (default: $ROS_DOMAIN_ID, else 0)"""
+    """with --ros2: ROS domain (default: $ROS_DOMAIN_ID, else 0)"""
     accept: Annotated[tuple[str, ...] | None, parsed(acceptable, "TOPICS", is_one=True)] = None
-    """with --ros2: let ROS 2 ask for assist (intent), stop the robot (estop), or both
+    """with --ros2: let ROS 2 request assist (intent), stop the robot (estop), or both
     (intent,estop)"""
     readonly: bool = False
-    """the joint services read their drives and publish, and send the drives nothing"""
+    """let the joint services read their drives and publish, but send nothing to the drives"""
 
     def check(self) -> None:
-        """Refuse what is for a service that is not started."""
+        """Refuse flags of services that are not started."""
         super().check()
         only = self.only
         absent = {"simulator"} if self.no_sim else set()
         if only is not None:
             if not only:
                 raise FleetError(
-                    "--only names no service; for example --only planner,harness,recorder"
+                    "--only names no service; give some, such as --only planner,harness,recorder"
                 )
             check_known(only, [row.name for row in load_table().process])
             if HOST_RECORDER in only and ("recorder" in only or not _of_host(only)):
                 raise FleetError(
-                    f"{HOST_RECORDER} is for a host without the recorder, beside services of its "
-                    "own; name those, and leave the recorder"
+                    f"--only: {HOST_RECORDER} is for a host that runs other services but not the "
+                    "recorder; add those services, and remove recorder"
                 )
             absent |= {"simulator", "recorder", "planner", *MODULES} - set(only)
             if HOST_RECORDER in only:
-                absent.discard("recorder")  # what is for one recorder is for the other
+                absent.discard("recorder")  # flags of one recorder are flags of the other
         for option, is_given, service in (
             ("--scenario", self.scenario is not None, "simulator"),
             ("--plant", bool(self.plant), "simulator"),
@@ -113,14 +113,16 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
         ):
             if is_given and service in absent:
                 why = "--no-sim" if only is None or service in only else "--only"
-                raise FleetError(f"{option} is for the {service}, and {why} starts none; leave one")
+                raise FleetError(
+                    f"{option} needs the {service}, which {why} does not start; remove one of them"
+                )
         for option, given in (("--domain", self.domain), ("--accept", self.accept)):
             if given is not None and not self.ros2:
-                raise FleetError(f"{option} is for the gateway to ROS 2: add --ros2")
+                raise FleetError(f"{option} needs the gateway to ROS 2; add --ros2")
 
     @property
     def services(self) -> tuple[str, ...] | None:
-        """What is started; None for all."""
+        """Services to start; None for all."""
         if self.only is None:
             return None
         beside = {"network_proxy": self.injectable, "ros2_gateway": self.ros2}
@@ -128,7 +130,7 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
 
 
 def run(flags: UpFlags) -> int:
-    """Start the fleet and say where it is."""
+    """Start the fleet and print its run directory."""
     robot = config_file.load(flags.config)
     gain_schedule.require(robot, flags.config)
     if robot.bus.security.mode == "mtls":
@@ -136,7 +138,7 @@ def run(flags: UpFlags) -> int:
     services = flags.services
     out = flags.out or Path("out") / time.strftime("%Y%m%d-%H%M%S")
     if flags.controller is not None:
-        controller_maker(flags.controller, robot)  # refused before anything is started
+        controller_maker(flags.controller, robot)  # reject it before anything is started
     overrides = _overrides(flags, out)
     if flags.ros2:
         overrides["ros2_gateway"] = _ros2_words(flags, robot)
@@ -161,7 +163,7 @@ def run(flags: UpFlags) -> int:
             fleet = SupervisedFleet.start(flags.config, flags.run_dir, options)
     except BaseException:
         if made:
-            with contextlib.suppress(OSError):  # it has a record, or was never made
+            with contextlib.suppress(OSError):  # it holds a record, or was never created
                 out.rmdir()
         raise
     warn_of_others(Console(), own=fleet.run.path)
@@ -177,20 +179,20 @@ def run(flags: UpFlags) -> int:
 
 
 def _check_keys(robot: RobotConfig, *, must: bool) -> None:
-    """Refuse keys by which no link comes; where nobody looks on, the services start and wait."""
+    """Refuse keys that allow no link; on an automatic start, print a warning instead."""
     folder = keys_folder(robot)
     wrong = [f"{row.name}: {row.wrong}" for row in inspect_keys(folder, robot) if row.wrong]
     if not wrong:
         return
-    more = f"; and {len(wrong) - 1} more, by `xrl keys check`" if len(wrong) > 1 else ""
+    more = f"; and {len(wrong) - 1} more: see `xrl keys check`" if len(wrong) > 1 else ""
     words = f"{folder}: {wrong[0]}{more}"
     if must:
         raise BusError(words)
-    print(f"xrl: no link over TLS: {words}", file=sys.stderr)
+    print(f"xrl: links over TLS will fail: {words}", file=sys.stderr)
 
 
 def _make_record_folder(out: Path, *, must: bool) -> None:
-    """Make the folder of the record; where nobody looks on, a robot starts without it."""
+    """Create the record's folder; on an automatic start, print a warning if that fails."""
     try:
         make_out(out, "up")
     except RunError as error:
@@ -217,7 +219,7 @@ def _overrides(flags: UpFlags, out: Path) -> dict[str, list[str]]:
         overrides["simulator"] = ["--scenario", path, "--autostart", str(SETTLE_S)]
         overrides["recorder"] += ["--scenario", path, "--scenario-text", flags.scenario]
     if flags.plant:
-        plant_from(flags.plant)  # refused before anything is started
+        plant_from(flags.plant)  # reject invalid values before anything is started
         words = [word for given in flags.plant for word in ("--plant", _absolute(given))]
         overrides["simulator"] = [*overrides.get("simulator", []), *words]
     return overrides
@@ -235,10 +237,10 @@ def _ros2_words(flags: UpFlags, robot: RobotConfig) -> list[str]:
 
 
 def _of_host(only: tuple[str, ...] | None) -> str:
-    """Return what a host's own recorder records: the services that run beside it."""
+    """Return the services that a host's own recorder records: those on the same host."""
     return ",".join(name for name in only or () if name in SERVICES)
 
 
 def _absolute(word: str) -> str:
-    """Return a word of `--plant`; a file's path as it is from anywhere."""
+    """Return a word of `--plant`, with the path of a file made absolute."""
     return str(Path(word).absolute()) if word.endswith(".toml") and "=" not in word else word

@@ -1,4 +1,4 @@
-"""`xrl view`: the robot in a browser."""
+"""`xrl view`: shows the robot in a browser."""
 
 from __future__ import annotations
 
@@ -27,37 +27,39 @@ from tools.view.record import RecordFrames, single_file
 from tools.view.serving import PortFlags, serve
 
 EXAMPLES: Final = """
-xrl view                       # the running fleet, without touching it
+xrl view                       # show the running fleet, without acting on it
 xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
-xrl view out/demo/run.mcap     # writes a record as one page: play, pause, step, scrub
+xrl view out/demo/run.mcap     # write a record as one page: play, pause, step, scrub
 xrl view out/demo/run.mcap --html run.html
-xrl view --sim                 # a robot in this process: lead it, push it, kill its planner
+xrl view --sim                 # simulate a robot: lead it, push it, kill its planner
 """
 
 
 class ViewFlags(PortFlags, PartFlags, RunDirFlags):
-    """What is shown, and where."""
+    """Source to show, and how to serve it."""
 
     record: Run | None = None
     sim: bool = False
     """simulate a robot in this process, in virtual time"""
     html: Path | None = None
-    """with a record: path of its page, which needs no server (default: NAME.view.html beside it)"""
+    """with a record: path of its page, which needs no server (default: NAME.view.html beside the
+    record)"""
     act: bool = False
-    """let the page act on the running fleet; for a real robot you type its name first"""
+    """let the page act on the running fleet; for a real robot you must type its name first"""
     config: Annotated[Path | None, robot_file_of("that of the record or of the fleet")] = None
 
     def check(self) -> None:
-        """Refuse what does not go with a record or with --sim."""
+        """Refuse flags that contradict a record or --sim."""
         super().check()
         if self.sim and self.record is not None:
-            raise RunError("a record and --sim do not go together; leave one out")
+            raise RunError("a record and --sim exclude each other; remove one of them")
         if self.act and (self.sim or self.record is not None):
             raise RunError(
-                "--act is for the fleet that is up; --sim needs none, a record takes none"
+                "--act needs a running fleet; remove it: a page always acts on --sim, and never on "
+                "a record"
             )
         if self.html is not None and self.record is None:
-            raise RunError("--html is for a record: name one")
+            raise RunError("--html needs a record; give one, such as out/demo/run.mcap")
 
 
 def run(flags: ViewFlags) -> int:
@@ -93,7 +95,7 @@ def _source(flags: ViewFlags) -> Iterator[Source]:
 
 
 def _write(flags: ViewFlags, index: RunIndex) -> int:
-    """Write a record into one file."""
+    """Write a record as one page."""
     log = read_asked(flags, index)
     record = RecordFrames(log, robot_of(log))
     length_s = record.model.end_s - record.model.begin_s
@@ -107,16 +109,19 @@ def _write(flags: ViewFlags, index: RunIndex) -> int:
 
 
 def confirm(robot: RobotConfig) -> None:
-    """Have a person type the name of a real robot that a page may act on."""
+    """Require a person to type the name of a real robot before a page may act on it."""
     if not sys.stdin.isatty():
-        raise FleetError("a page may act on a real robot only if somebody types its name here")
+        raise FleetError(
+            "a page may act on a real robot only after a person types its name; run `xrl view "
+            "--act` in a terminal"
+        )
     console = Console()
     console.print(
         marked(
-            "[bold red]This is a real robot.[/] A page can kill its services and stop it, and "
-            "does not replace a switch that cuts the power."
+            "[bold red]This is a real robot.[/] A page can kill its services and stop it, but does "
+            "not replace a switch that cuts the power."
         )
     )
     typed = console.input(f"Type its name ({robot.name}) to continue: ")
     if typed.strip() != robot.name:
-        raise FleetError(f"{typed.strip()!r} is another name; nothing was started")
+        raise FleetError(f"{typed.strip()!r} is not the name of this robot; nothing was started")

@@ -1,1 +1,1 @@
-"""`xrl view`: the robot in a browser, of a record, a live fleet or in lockstep (docs/view.md)."""
+"""`xrl view`: shows the robot in a browser, from a record, a fleet or lockstep (docs/view.md)."""

@@ -1,4 +1,4 @@
-"""What the page shows at one moment, and where that comes from: a record, a fleet, or lockstep."""
+"""Frames for the page at one moment, and their sources: a record, a fleet, or lockstep."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tools.judge.reports.robot_pose import pose_of_legs
 from tools.topic_keys import every_key
 
 LEAST_N: Final = 20.0
-"""A sole that bears less has no centre of pressure worth showing."""
+"""A sole with less load has no meaningful centre of pressure."""
 
 
 _TOPICS: Final = (
@@ -53,20 +53,20 @@ _TOPICS: Final = (
     topics.JOINT_COMMAND,
 )  # fmt: skip
 SHOWN: Final = tuple(key for key in every_key() if key.topic in _TOPICS)
-"""Keys of the messages that a frame is made of."""
+"""Keys of the messages that a frame needs."""
 STALE_NS: Final = NS_PER_S // 2
-"""An older message is not shown: its sender is dead, stopped or cut off."""
+"""An older message is stale and not shown: its sender is dead, stopped or cut off."""
 DIGITS: Final = 5
-"""Behind the point: 0.01 mm."""
+"""Decimals: 0.01 mm."""
 
 
-class PlannerShown(msgspec.Struct, frozen=True):
-    """What the page shows of the planner."""
+class _PlannerShown(msgspec.Struct, frozen=True):
+    """The planner's values on the page."""
 
     mode: str
     """Name of its `PlannerMode`."""
     why: str
-    """Why it does not lead."""
+    """Reason why it does not lead."""
     wait_s: float
     margin: float
     margin_onboard: float
@@ -74,17 +74,17 @@ class PlannerShown(msgspec.Struct, frozen=True):
     """None in virtual time, where it is not measured."""
     assist_n: float
     height_ref: float
-    """COM height that it follows, m."""
+    """COM height reference, m."""
     heat_left_s: float = -1.0
     """Seconds left at this load, as in `PlannerStatus`."""
     carried_n: float = 0.0
     """As in `PlannerStatus`."""
     wearer: str = ""
-    """What it makes of the person, in words; empty if they lead."""
+    """The wearer's state in words; empty if they lead."""
 
 
 class ShownProcess(msgspec.Struct, frozen=True):
-    """One process of a live fleet, by its supervisor."""
+    """One process of a live fleet, as seen by its supervisor."""
 
     name: str
     state: str
@@ -92,12 +92,12 @@ class ShownProcess(msgspec.Struct, frozen=True):
 
 
 class Frame(msgspec.Struct, frozen=True):
-    """One moment of the robot; SI units, world axes unless it says otherwise."""
+    """One moment of the robot; SI units and world axes unless stated otherwise."""
 
     t_s: float
-    """Scenario time while there is one, else since the first frame."""
+    """Scenario time during a scenario, else time since the first frame."""
     begun: bool
-    """True: a scenario runs."""
+    """True during a scenario."""
     torso: Vector3
     """Origin of the torso, m."""
     angles: Vector3
@@ -106,41 +106,41 @@ class Frame(msgspec.Struct, frozen=True):
     q: tuple[float, ...]
     """Joint angles (12,), rad."""
     q_ref: tuple[float, ...]
-    """Their references (12,), rad; empty if no planner is heard."""
+    """Their references (12,), rad; empty without a planner."""
     modes: tuple[int, ...]
-    """`Mode` of each module; -1: silent."""
+    """`Mode` of each module; -1 if silent."""
     drives: tuple[int, ...]
     ages_ms: tuple[float, ...]
-    """Age of the command that each module uses; -1: none."""
+    """Age of the command that each module uses; -1 if none."""
     tau: tuple[float, ...]
     """Joint torques (12,), N m."""
     force: Vector3
-    """The person's force on the torso, N, torso axes."""
+    """Force of the person on the torso, N, torso axes."""
     push: Vector3
     """N."""
-    planner: PlannerShown | None
-    """None: not heard."""
+    planner: _PlannerShown | None
+    """None if silent."""
     is_true: bool
-    """True: the pose is that of the simulated world; else what the legs' kinematics know."""
+    """True if the pose comes from the simulated world, False if from the legs' kinematics."""
     fallen: bool
     capture: tuple[float, ...]
     """Capture point: COM + its rate / sqrt(g / height), x and y, m; empty without a planner."""
     soles: tuple[SoleLoad, ...]
-    """Right and left; empty if not known."""
+    """Right and left; empty if unknown."""
     soles_estimated: bool
-    """True: from the legs' torques; False: the simulated world's own."""
+    """True if estimated from the legs' torques, False if from the simulated world."""
     ways_out: tuple[str, ...]
-    """For each module what lets it track again; empty if nothing is needed."""
+    """Remedy for each module that lets it track again; empty if none is needed."""
     processes: tuple[ShownProcess, ...] = ()
     """Processes of a live fleet on this host; empty for the other sources."""
     network: tuple[str, ...] = ()
     """Active impairments of a live fleet's network, in words."""
     stall: str = ""
-    """The last stall of the machine, in words, for some moments after it."""
+    """The last stall of the machine, in words, for a few moments afterwards."""
 
 
 class Newest:
-    """The newest message of each key that a frame is made of."""
+    """The newest message of each key that a frame needs."""
 
     def __init__(self, robot: RobotConfig) -> None:
         self._kinematics, self._measured = Kinematics(robot), Measured(robot)
@@ -148,7 +148,7 @@ class Newest:
         self.clear()
 
     def clear(self) -> None:
-        """Forget every message."""
+        """Drop every message."""
         self._rows: dict[tuple[str, str], Any] = {}
         self._first_ns: int | None = None
 
@@ -159,12 +159,12 @@ class Newest:
 
     @property
     def scenario_s(self) -> float:
-        """Scenario time of the newest truth, s; negative: no scenario runs."""
+        """Scenario time of the newest truth, s; negative without a scenario."""
         truth: SimTruth | None = self._rows.get((topics.SIM_TRUTH.name, ""))
         return truth.scenario_s if truth is not None else -1.0
 
     def frame(self, now_ns: int) -> Frame | None:
-        """Return what is known now; None until each module was heard once."""
+        """Return the present frame, or None until every module has sent a state."""
         states: list[JointState] = [
             row for row in self._of_modules(topics.JOINT_STATE) if row.t_ns > 0
         ]
@@ -244,9 +244,9 @@ class Newest:
         return _shown_soles(self.estimated_soles(q, tau)), True
 
     def estimated_soles(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, ...]:
-        """Return the loads of both soles by the joints' torques; nothing if a leg is too straight.
+        """Return the loads of both soles from the joints' torques; empty if a leg is too straight.
 
-        An ankle's torque over the load is how far the pressure is from below that ankle.
+        An ankle's torque divided by the load is the distance of the pressure from that ankle.
         """
         self._measured.update(np.array(q), np.zeros(len(q)))
         loads = self._soles.loads(self._measured.leg_loads(np.array(tau)))
@@ -259,8 +259,8 @@ class Newest:
         return tuple(found)
 
 
-def _shown(status: PlannerStatus) -> PlannerShown:
-    return PlannerShown(
+def _shown(status: PlannerStatus) -> _PlannerShown:
+    return _PlannerShown(
         mode=name_of(PlannerMode, status.mode),
         why=status.why,
         wait_s=status.wait_s,
@@ -276,7 +276,7 @@ def _shown(status: PlannerStatus) -> PlannerShown:
 
 
 def _capture_point(status: PlannerStatus) -> tuple[float, ...]:
-    """Return the capture point as it is drawn; nothing before the first tick."""
+    """Return the capture point for the picture; empty before the first tick."""
     if status.p[2] <= 0.0:
         return ()
     return _short(capture_point(status.p, status.pdot))
@@ -289,7 +289,7 @@ def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleLoad, ...]:
 
 
 def _short(values: Iterable[float]) -> tuple[float, ...]:
-    """Return numbers as a picture needs them: half as long on their way as with all digits."""
+    """Return numbers rounded for a picture, which halves their length on the wire."""
     return tuple(round(value, DIGITS) for value in values)
 
 
@@ -309,7 +309,7 @@ CUTS: Final[Mapping[str, tuple[str, ...]]] = {
     "right leg": ("planner->right", "right->planner"),
     "all": ("all",),
 }
-"""What a page can cut off from the planner: links by name."""
+"""Groups of links that a page can cut off from the planner, by name."""
 CUT_S: Final = 2.0
 
 
@@ -330,11 +330,11 @@ class ShownBody(msgspec.Struct, frozen=True):
     size: Vector3
     """Along x, y and z; the diameter where the body is round."""
     position: Vector3 = ORIGIN
-    """Of its centre."""
+    """Position of its centre."""
 
 
 def _bodies_of(robot: RobotConfig) -> tuple[ShownBody, ...]:
-    """Return the torso, and on each leg thigh, shin and sole."""
+    """Return the torso, and thigh, shin and sole of each leg."""
     geometry = robot.geometry
     found = [ShownBody("torso", "cube", geometry.torso_size)]
     sole = (geometry.l_foot, geometry.w_foot, geometry.foot_height / 2)
@@ -348,14 +348,14 @@ def _bodies_of(robot: RobotConfig) -> tuple[ShownBody, ...]:
 
 
 class Order(msgspec.Struct, frozen=True):
-    """What a person does on the page; which orders a source takes is in `Model.orders`."""
+    """A person's action on the page; `Model.orders` lists those that a source accepts."""
 
     order: str
     """`kill`, `freeze`, `start`, `cut`, `estop`, `hand` or `push`."""
     service: str = ""
     """Service to `kill`, `freeze` or `start`; for `cut` a name in `CUTS`."""
     height: float = 0.0
-    """For `hand`: where to lead the torso, m above the ankles."""
+    """For `hand`: torso height to lead to, m above the ankles."""
     pitch: float = 0.0
     """For `hand`, rad."""
     force: Vector3 = (0.0, 0.0, 0.0)
@@ -363,7 +363,7 @@ class Order(msgspec.Struct, frozen=True):
 
 
 class Model(msgspec.Struct, frozen=True):
-    """What does not change while the page is open."""
+    """The data that stay constant while the page is open."""
 
     robot: str
     source: str
@@ -372,23 +372,23 @@ class Model(msgspec.Struct, frozen=True):
     modules: tuple[str, ...]
     modes: dict[int, str]
     joints: dict[str, tuple[str, Vector3]]
-    """By module: the frame that it hangs in, and where, m."""
+    """By module: its parent frame, and its position there, m."""
     bodies: tuple[ShownBody, ...]
     harness: Vector3
-    """On the torso, m."""
+    """Position on the torso, m."""
     foot: Vector3
     """Length, width, and height of the ankle's axis above the floor, m."""
     orders: tuple[str, ...] = ()
     processes: tuple[str, ...] = ()
-    """That `kill`, `freeze` and `start` are for."""
+    """Processes that `kill`, `freeze` and `start` accept."""
     begin_s: float = 0.0
     end_s: float = 0.0
-    """A record's end on its timeline; equal to `begin_s`: there is no timeline."""
+    """End of a record on its timeline; equal to `begin_s` without a timeline."""
     marks: tuple[Mark, ...] = ()
 
 
 def model_of(robot: RobotConfig, kind: str, title: str) -> Model:
-    """Return what does not change of a robot."""
+    """Return the constant data of a robot."""
     geometry = robot.geometry
     still = {row.child: row for row in body_frames(geometry, (0.0,) * len(JOINTS))}
     return Model(
@@ -405,7 +405,7 @@ def model_of(robot: RobotConfig, kind: str, title: str) -> Model:
 
 
 class Source(ABC):
-    """Frames of one robot that moves now."""
+    """Frames of one robot in motion."""
 
     kind: str
     title: str
@@ -416,38 +416,38 @@ class Source(ABC):
         self.robot = robot
 
     def model(self) -> Model:
-        """Return what does not change."""
+        """Return the constant data."""
         model = model_of(self.robot, self.kind, self.title)
         return msgspec.structs.replace(model, orders=self.orders, processes=self.processes)
 
     def connect(self) -> None:
-        """Begin to listen: somebody looks. May block for a moment."""
+        """Subscribe, when a page opens. May block for a moment."""
         return
 
     def disconnect(self) -> None:
-        """Stop listening: nobody looks any more."""
+        """Unsubscribe, when the last page has closed."""
         return
 
     @abstractmethod
     def frame(self) -> Frame | None:
-        """Return the newest frame; None: not yet."""
+        """Return the newest frame, or None before the first."""
 
     @abstractmethod
     def carry_out(self, order: Order) -> str:
-        """Do what a person asks for; return why not, or nothing. May block."""
+        """Carry out a person's order; return an error or an empty string. May block."""
 
 
 SOURCE = "xrl view"
 
 
 def without_fleet(frame: Frame) -> Frame:
-    """Return the frame of a robot without a fleet: without advice that needs one."""
+    """Return a frame without the advice that needs a fleet."""
     ways_out = tuple("" if "xrl " in way else way for way in frame.ways_out)
     return msgspec.structs.replace(frame, ways_out=ways_out)
 
 
 class HandOrders:
-    """Puts orders to lead and orders to push together: each message has both."""
+    """Combines orders to lead and orders to push, because each message contains both."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -456,7 +456,7 @@ class HandOrders:
         self._pushed_s = -PUSH_EXPIRES_S
 
     def message(self, order: Order) -> HandLead:
-        """Return the message of a `hand` or `push` order; its stamp is for the sender."""
+        """Return the message of a `hand` or `push` order; the sender sets its stamp."""
         now_s = self._clock()
         if order.order == "push":
             self._force, self._pushed_s = order.force, now_s

@@ -1,6 +1,6 @@
-"""Frames of a live fleet, and what a page may do to it.
+"""Frames of a live fleet, and a page's actions on it.
 
-It is subscribed only while somebody looks, and acted on only when allowed.
+It subscribes only while a page is open, and acts only if allowed.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class LiveOrders:
     """Carries out a page's orders.
 
     Attributes:
-        services: that can be killed, frozen and started; the planner first.
-        orders: that this fleet takes: `hand` and `push` only with a simulator.
+        services: services that can be killed, frozen and started; the planner first.
+        orders: orders that this fleet accepts; `hand` and `push` only with a simulator.
     """
 
     def __init__(
@@ -71,47 +71,47 @@ class LiveOrders:
         self._led = self._told = 0
 
     def begin(self, session: Session) -> None:
-        """Take the session that is open while somebody looks."""
+        """Use the session that is open while a page is open."""
         self._hand = HandOrders()
         self._publisher = session.publisher(topics.OPERATOR_HAND, HandLead)
         self._events = session.publisher(topics.RUN_EVENT, RunEvent)
         self._stop = BusStop(self._robot, session, self._fleet.run.path)
 
     def end(self) -> None:
-        """The session is about to be closed."""
+        """Release the session before it closes."""
         self._publisher = self._events = self._stop = None
 
     def carry_out(self, order: Order) -> str:
-        """Do it, and return why not, or nothing; may block for some seconds."""
+        """Carry out an order; return an error or an empty string. May block for some seconds."""
         carrier = self._carriers.get(order.order)
         if carrier is None:
-            return f"{order.order!r} is no order here; one of {', '.join(self.orders)}"
+            return f"{order.order!r} is not an order here; must be one of {', '.join(self.orders)}"
         try:
             carrier(order)
-        except (XrlError, OSError) as error:  # a process may end while it is signalled
+        except (XrlError, OSError) as error:  # a process may end before the signal
             return str(error)
         return ""
 
     def _lead(self, order: Order) -> None:
         publisher = self._publisher
         if publisher is None:
-            raise FleetError("the hand is not linked yet")
+            raise FleetError("the hand has no link yet")
         self._led += 1
         asked = self._hand.message(order)
         publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._led))
 
     def _estop(self, _order: Order) -> None:
-        """Stop all, first by shared memory."""
+        """Stop all modules, first through shared memory."""
         request_here(self._fleet.run.path)
         stop = self._stop
         if stop is None:
-            raise FleetError("by shared memory only: the bus is not linked")
+            raise FleetError("stopped through shared memory only: there is no link to the bus")
         going = stop.stop()
         if going:
             raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
 
     def _kill(self, order: Order) -> None:
-        # A person asks for its next process, which may arm the drive.
+        # A person requests its next process, which may arm the drive.
         fault = self._fleet.forget(order.service) if order.service in MODULES else ""
         self._fleet.kill(order.service, signal.SIGKILL)
         self._tell(RunEventKind.KILLED, order.service, "KILL")
@@ -146,18 +146,18 @@ class LiveOrders:
     def _cut(self, order: Order) -> None:
         links = CUTS.get(order.service)
         if links is None:
-            raise FleetError(f"{order.service!r}: one of {', '.join(CUTS)}")
+            raise FleetError(f"{order.service!r}: must be one of {', '.join(CUTS)}")
         proxy = ProxyClient(self._fleet.run.path)
         for link in links:
             proxy.begin(Inject(link=link, at=0.0, duration=CUT_S, partition=True))
 
 
 LOOK_S: Final = 1.0
-"""The supervisor is asked so often how its processes do."""
+"""Period of the request to the supervisor for its processes, s."""
 
 
 class LiveSource(Source):
-    """The fleet whose sockets are in a run directory, or at the robot file's hosts."""
+    """The fleet whose sockets are in a run directory, or on the robot file's hosts."""
 
     kind = "live"
 
@@ -210,7 +210,7 @@ class LiveSource(Source):
         for topic, module, latest in self._latest:
             message = latest.take()
             if message is not None:
-                # by its arrival: its own time is its host's, which may be another
+                # by its arrival, because its own stamp may be on another host's clock
                 message = msgspec.structs.replace(message, t_ns=now_ns())
                 self._newest.add(topic, module, message)
         found = self._newest.frame(now_ns())
@@ -219,18 +219,18 @@ class LiveSource(Source):
         return msgspec.structs.replace(found, processes=self._processes, network=self._network)
 
     def carry_out(self, order: Order) -> str:
-        """Do what a page asks for, if it may; may block for some seconds."""
+        """Carry out a page's order, if allowed; may block for some seconds."""
         if self._acting is None:
-            return f"{order.order}: this page only looks; `xrl view --act` lets it act"
+            return f"{order.order}: this page cannot act; `xrl view --act` lets it act"
         return self._acting.carry_out(order)
 
     def _look(self) -> None:
-        """Ask the supervisor and the network proxy, until nobody looks any more."""
+        """Query the supervisor and the network proxy until the last page has closed."""
         while not self._left.is_set():
             try:
                 rows = self._fleet.info()
                 self._processes = tuple(ShownProcess(r.name, r.state, r.restarts) for r in rows)
                 self._network = impairments(self._fleet)
-            except Exception as error:  # noqa: BLE001 - told on the page, whatever it is
-                self._processes, self._network = (), (f"not known: {error}",)
+            except Exception as error:  # noqa: BLE001 - the page shows any error
+                self._processes, self._network = (), (f"unknown: {error}",)
             self._left.wait(LOOK_S)

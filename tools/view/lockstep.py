@@ -1,4 +1,4 @@
-"""Frames of a robot in lockstep, in this process: a weak laptop's robot, and the tests'."""
+"""Frames of a robot in lockstep, in this process: for weak laptops and for tests."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tools.view.frame import CUT_S, CUTS, Frame, HandOrders, Newest, Order, Sour
 
 _FOREVER_S: Final = 1e9
 _STEP_S: Final = 0.01
-"""So much virtual time at once, then the orders."""
+"""Virtual time per step, s; the orders come between steps."""
 
 
 class LockstepSource(Source):
-    """A robot in virtual time that keeps to real time, in a thread of its own."""
+    """A robot in virtual time, synchronised with real time, in its own thread."""
 
     kind = "lockstep"
     orders = ("hand", "push", "kill", "freeze", "start", "cut", "estop")
@@ -48,21 +48,21 @@ class LockstepSource(Source):
         self._thread.join()
 
     def frame(self) -> Frame | None:
-        """Return the newest frame; None until it stands."""
+        """Return the newest frame, or None until the robot stands."""
         if self._failed:
             raise RunError(self._failed)
         with self._lock:
             return self._frame
 
     def carry_out(self, order: Order) -> str:
-        """Hand an order to the robot; return why not, or nothing."""
+        """Pass an order to the robot; return an error or an empty string."""
         if order.order not in self.orders:
-            return f"{order.order!r} is no order; one of {', '.join(self.orders)}"
+            return f"{order.order!r} is not an order; must be one of {', '.join(self.orders)}"
         named = order.order in ("kill", "freeze", "start")
         if named and order.service not in self.processes:
-            return f"{order.service!r} has no process here; planner or a module"
+            return f"{order.service!r} has no process here; must be planner or a module"
         if order.order == "cut" and order.service not in CUTS:
-            return f"{order.service!r}: one of {', '.join(CUTS)}"
+            return f"{order.service!r}: must be one of {', '.join(CUTS)}"
         self._orders.put(order)
         return ""
 
@@ -71,7 +71,7 @@ class LockstepSource(Source):
             self._live()
         except Exception as error:
             self._failed = f"the robot in this process has ended: {error}"
-            raise  # told in the terminal, too
+            raise  # so that the terminal shows it too
 
     def _live(self) -> None:
         robot = self.robot
@@ -97,7 +97,7 @@ class LockstepSource(Source):
                 found = without_fleet(msgspec.structs.replace(found, network=network))
             with self._lock:
                 self._frame = found
-            due = max(due + _STEP_S, time.monotonic() - 0.2)  # a slow machine: slow motion
+            due = max(due + _STEP_S, time.monotonic() - 0.2)  # slow motion on a slow machine
             time.sleep(max(0.0, due - time.monotonic()))
 
     @staticmethod

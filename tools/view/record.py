@@ -1,4 +1,4 @@
-"""Frames of a record: any moment of it, in any order; and the page with a whole record in it."""
+"""Frames of a record at any time, in any order; and the page that contains a whole record."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class RecordFrames:
         self._newest = Newest(robot)
         self._keys = [(t, m, log.newest(t, m)) for t, m in SHOWN if t is not topics.RUN_EVENT]
         stalls = [row for row in log.messages(topics.RUN_EVENT) if row.kind == RunEventKind.STALLED]
-        stalls.sort(key=lambda row: row.t_ns)  # each tells when it ended, and is told later
+        stalls.sort(key=lambda row: row.t_ns)  # an event has the end of its stall, and comes later
         self._keys.append((topics.RUN_EVENT, "", NewestAt(stalls)))
         span = self._data.span
         self.model = msgspec.structs.replace(
@@ -48,7 +48,7 @@ class RecordFrames:
         )  # fmt: skip
 
     def at(self, t_s: float) -> Frame | None:
-        """Return the frame at a time of the timeline; None before each module was heard."""
+        """Return the frame at a time of the timeline, or None before all modules have sent."""
         t_ns = self._data.zero_ns + round(t_s * NS_PER_S)
         newest = self._newest
         newest.clear()
@@ -63,7 +63,7 @@ class RecordFrames:
 _MODULES: Final = (
     "vendor/three/three.module.min.js", "recorded.js", "plots.js", "scene.js", "main.js",
 )  # fmt: skip
-"""Each after those that it imports."""
+"""Each module comes after those that it imports."""
 _LOADER: Final = """
 const urls = {};
 for (const node of document.querySelectorAll("script[data-module]")) {
@@ -75,7 +75,7 @@ import(urls["./main.js"]);
 
 
 def single_file(record: RecordFrames, done: Callable[[float], None] = lambda _s: None) -> bytes:
-    """Return the page with a whole record in it."""
+    """Return the page with a whole record in it, as one file."""
     model = record.model
     count = round((model.end_s - model.begin_s) * FRAMES_S) + 1
     frames = []
@@ -83,7 +83,7 @@ def single_file(record: RecordFrames, done: Callable[[float], None] = lambda _s:
         frames.append(record.at(min(model.end_s, model.begin_s + number / FRAMES_S)))
         done(number / FRAMES_S)
     if not any(frames):
-        raise RunError(f"{model.title}: no moment at which all six modules were heard")
+        raise RunError(f"{model.title}: there is no time at which all six modules have a state")
     run = {"model": model, "frames": frames, "every_s": 1.0 / FRAMES_S}
     packed = base64.b64encode(gzip.compress(msgspec.json.encode(run), mtime=0)).decode()
     page = (PAGE / "index.html").read_text(encoding="utf-8")
@@ -97,7 +97,7 @@ def single_file(record: RecordFrames, done: Callable[[float], None] = lambda _s:
 
 
 def _content(name: str) -> str:
-    """Return one of the page's files; a script's text must not end the script around it."""
+    """Return one of the page's files, escaped so that it cannot end the script around it."""
     file = PAGE / name if not name.startswith("vendor/uplot/") else UPLOT / name.rpartition("/")[2]
     return file.read_text(encoding="utf-8").replace("</script", "<\\/script")
 

@@ -1,7 +1,7 @@
-"""The page's server: one asyncio loop, on this computer only, for whoever knows the token.
+"""The page's server: one asyncio loop, reachable only from this computer and with the token.
 
-Every request needs the token in its path, and this server's own name as Host; a WebSocket also its
-own Origin. A page of a stranger in the same browser has none of them.
+Every request needs the token in its path, and this server's own name as Host; a WebSocket also
+needs its Origin. A page from another site in the same browser lacks these.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ MESSAGE_MAX: Final = 4096
 """Largest message of a page, bytes."""
 CLIENTS_MAX: Final = 8
 ORDERS_MAX: Final = 64
-"""Orders of a page that wait; a hand is moved 60 times a second."""
+"""Maximum number of waiting orders of a page; a hand is moved 60 times a second."""
 CLOSE_S: Final = 1.0
-"""Longest wait for a page to take what is left and to close."""
+"""Timeout for a page to receive the rest and close, s."""
 STOPS_MAX: Final = 4
-"""Emergency stops under way at a time; each repeats itself for up to three seconds."""
+"""Maximum number of concurrent emergency stops; each repeats for up to three seconds."""
 _TYPES: Final = {
     ".html": "text/html", ".js": "text/javascript", ".css": "text/css",
 }  # fmt: skip
@@ -44,7 +44,7 @@ _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class ViewServer:
-    """Serves one source to some pages."""
+    """Serves one source to several pages."""
 
     def __init__(self, source: Source, port: int = PORT, token: str = "") -> None:
         self._source = source
@@ -56,16 +56,16 @@ class ViewServer:
         self._sockets: dict[web.WebSocketResponse, asyncio.Transport | None] = {}
         self._lock = asyncio.Lock()
         self._stopper = ThreadPoolExecutor(STOPS_MAX, "stop")
-        """An emergency stop waits for no other order."""
+        """Lets an emergency stop bypass other orders."""
 
     @property
     def address(self) -> str:
-        """What a person opens."""
+        """The address to open in a browser."""
         return f"http://{HOST}:{self._port}/{self._token}/"
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Serve meanwhile."""
+        """Serve while the context is open."""
         app = web.Application(middlewares=[self._guard], client_max_size=MESSAGE_MAX)
         app.router.add_get("/{token}/ws", self._socket)
         app.router.add_get("/{token}/{file:.*}", self._file)
@@ -75,7 +75,7 @@ class ViewServer:
             await web.TCPSite(runner, HOST, self._port, reuse_address=True).start()
         except OSError as error:
             await runner.cleanup()
-            text = f"port {self._port} of {HOST}: {error.strerror}; give another --port"
+            text = f"port {self._port} of {HOST}: {error.strerror}; choose another --port"
             raise FleetError(text) from None
         self._port = runner.addresses[0][1]
         try:
@@ -110,9 +110,9 @@ class ViewServer:
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if request.headers.get("Origin") is None:
-            return web.Response(status=403, text="a page's own Origin is needed\n")
+            return web.Response(status=403, text="the request must have the page's own Origin\n")
         if self._clients >= CLIENTS_MAX:
-            return web.Response(status=503, text=f"{CLIENTS_MAX} pages are open already\n")
+            return web.Response(status=503, text=f"{CLIENTS_MAX} pages are already open\n")
         socket = web.WebSocketResponse(max_msg_size=MESSAGE_MAX, heartbeat=20.0)
         await socket.prepare(request)
         self._clients += 1
@@ -140,7 +140,7 @@ class ViewServer:
         return socket
 
     async def _send(self, socket: web.WebSocketResponse) -> None:
-        """Send a frame 30 times a second; while a page does not drain, the next are skipped."""
+        """Send a frame 30 times a second; skip frames while a page does not read."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         sent = b""
@@ -158,7 +158,7 @@ class ViewServer:
             await asyncio.sleep(due - loop.time())
 
     async def _receive(self, socket: web.WebSocketResponse) -> None:
-        """Take what the page asks for, until it is gone."""
+        """Receive the page's orders until it closes."""
         waiting: asyncio.Queue[Order] = asyncio.Queue(ORDERS_MAX)
         worker = asyncio.create_task(self._work(socket, waiting))
         stops = set[asyncio.Task[None]]()
@@ -173,9 +173,9 @@ class ViewServer:
                     else:
                         waiting.put_nowait(order)
                 except (msgspec.DecodeError, msgspec.ValidationError) as error:
-                    await socket.send_json({"error": f"not understood: {error}"})
+                    await socket.send_json({"error": f"not a valid order: {error}"})
                 except asyncio.QueueFull:
-                    await socket.send_json({"error": "too many orders at once: some are left out"})
+                    await socket.send_json({"error": "too many orders at once: some were dropped"})
         finally:
             worker.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
@@ -197,7 +197,7 @@ class ViewServer:
 
 
 async def _end(socket: web.WebSocketResponse, transport: asyncio.Transport | None) -> None:
-    """Close a page's connection; one whose page does not read is cut."""
+    """Close a page's connection, and cut it if the page does not read."""
     try:
         async with asyncio.timeout(CLOSE_S):
             await socket.close()
@@ -207,14 +207,14 @@ async def _end(socket: web.WebSocketResponse, transport: asyncio.Transport | Non
 
 
 async def _told(socket: web.WebSocketResponse, why: str) -> None:
-    """Tell a page why an order was not carried out, if it was not and the page is there."""
+    """Send a page the error of an order, if there is one and the page is open."""
     if why and not socket.closed:
         with contextlib.suppress(ConnectionError):
             await socket.send_json({"error": why})
 
 
 def _files() -> dict[str, tuple[bytes, str]]:
-    """Return every file of the page by its name in the address."""
+    """Return every file of the page by its name in the URL."""
     found = {}
     for folder, prefix in ((PAGE, ""), (UPLOT, "vendor/uplot/")):
         for path in sorted(folder.rglob("*")):

@@ -1,6 +1,6 @@
-"""Serves a page from a process: until Ctrl-C, or beside a fleet for as long as that is up.
+"""Serves a page from a process: until Ctrl-C, or beside a fleet while that is up.
 
-`python -m tools.view.serving PID WORDS` is `xrl WORDS`, which ends when process PID does.
+`python -m tools.view.serving PID WORDS` is `xrl WORDS`, but ends when process PID does.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _END_S = 5.0
 
 
 class PortFlags(Flags):
-    """Where a page is served."""
+    """Port of the page's server."""
 
     port: Annotated[
-        int, Range(0, PORT_MAX, ""), Arg(help=f"of {HOST} (default: {PORT}); 0: any")
+        int, Range(0, PORT_MAX, ""), Arg(help=f"port on {HOST} (default: {PORT}); 0: any")
     ] = PORT
 
 
@@ -57,7 +57,7 @@ async def _serve(source: Source, port: int) -> None:
 
 @contextlib.contextmanager
 def served_beside(run_dir: Path, port: int) -> Iterator[str]:
-    """Serve a fleet that is up from a process of its own, in which a page may act; end it after."""
+    """Serve a running fleet from another process, whose page may act; end that afterwards."""
     command = [sys.executable, "-m", "tools.view.serving", str(os.getpid())]
     command += ["view", "--act", "--run-dir", str(run_dir), "--port", str(port)]
     log = run_dir / "logs" / "view.log"
@@ -68,10 +68,10 @@ def served_beside(run_dir: Path, port: int) -> Iterator[str]:
             stdout=subprocess.PIPE,
             stderr=said,
             text=True,
-            start_new_session=True,  # Ctrl-C in the terminal is for who has started it
+            start_new_session=True,  # Ctrl-C in the terminal is only for the parent
         )
     try:
-        assert process.stdout is not None  # noqa: S101 - a pipe was asked for
+        assert process.stdout is not None  # noqa: S101 - it is a pipe
         address = process.stdout.readline().partition(" ")[0]
         if not address:
             why = log.read_text(encoding="utf-8", errors="replace").strip()
@@ -87,7 +87,7 @@ def served_beside(run_dir: Path, port: int) -> Iterator[str]:
 
 
 def main() -> int:
-    """Run it."""
+    """Run the verb, tied to its parent."""
     from tools import cli  # noqa: PLC0415 - which loads this module for its verb
 
     parent, *words = sys.argv[1:]

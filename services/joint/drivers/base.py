@@ -1,4 +1,4 @@
-"""The one interface of all drives (docs/drives.md)."""
+"""Interface of all drives (docs/drives.md)."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ __all__ = [
 ]  # fmt: skip
 
 HEAT_EVERY_NS: Final = NS_PER_S
-"""How often a driver asks its drive for the temperatures, ns, where the firmware tells them."""
+"""Period of temperature requests to the drive, ns, if its firmware reports temperatures."""
 SUPPLY_EVERY_NS: Final = NS_PER_S // 2
-"""Time between two questions for the supply's voltage, ns."""
+"""Period of requests for the supply's voltage, ns."""
 LARGEST: Final = 1e9
-"""Largest target, in any unit; beyond it a single float holds no fraction."""
+"""Largest target, in any unit; beyond it, single precision holds no fraction."""
 CELSIUS: Final = (-40.0, 200.0)
-"""What a thermistor that is there reads; a pin without one reads 0 or nonsense."""
+"""Valid readings of a thermistor, C; a pin without a thermistor reads 0 or nonsense."""
 
 
 def real_readings(first: float, second: float) -> Pair | None:
-    """Return both axes' readings of a thermistor, C; None if one of them is no reading."""
+    """Return both axes' readings of a thermistor, C, or None unless both are valid."""
     low, high = CELSIUS
     both = (first, second)
     real = all(math.isfinite(one) and low < one < high and one != 0.0 for one in both)
@@ -45,24 +45,24 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     error: int
     """Error bits of both axes, or-ed."""
     torque: Pair | None = None
-    """Torque of the motors' own loops, N m; known while a drive that was found armed waits for its
-    take-over."""
+    """Torque of the motors' own loops, N m; known only while a drive that was found armed waits for
+    its take-over."""
     encoder_zero: Pair | None = None
-    """Where the encoders' angles within the turn are 0, turns modulo one, when the drive has just
-    answered that; `drive.set_position` moves it."""
+    """Positions at which the encoders' angles within the turn are 0, turns modulo one; None unless
+    the drive has just reported them. `drive.set_position` moves them."""
     fet_celsius: Pair | None = None
-    """What the thermistors of the output stages read, C; None: not with this sample."""
+    """Thermistor readings of the output stages, C; None without new ones."""
     motor_celsius: Pair | None = None
-    """What the motors' thermistors read, C; None: not with this sample, or there are none."""
+    """Thermistor readings of the motors, C; None without new ones or without thermistors."""
     supply_v: float = 0.0
-    """Voltage of the drive's supply as it was told last, V; 0: not known."""
+    """Last reported voltage of the drive's supply, V; 0 if unknown."""
 
     @property
     def angles(self) -> Pair | None:
         """Angles of both encoders within their motors' turns, turns from 0 to 1.
 
-        None: not with this sample. Absolute encoders keep them without power. Of a motor that
-        turns they are as old as the estimate.
+        None without new values. Absolute encoders keep the angles without power. For a turning
+        motor, the angles are as old as the estimate.
         """
         zero = self.encoder_zero
         if zero is None:
@@ -105,9 +105,9 @@ class Drive(Protocol):
     """One ODrive: axis0 and axis1 of a module."""
 
     def read(self, timeout_s: float) -> DriveReading | None:
-        """Wait for the next encoder sample of both axes; None if none came in time.
+        """Wait for the next encoder sample of both axes; None if it does not arrive in time.
 
-        Never raises for a lost link: that is `DriveStatus.LOST` in the next reading, or None.
+        Never raises for a lost link: the next reading is then `DriveStatus.LOST`, or None.
         """
 
     def write_torque(self, torque: Pair) -> None:
@@ -120,21 +120,21 @@ class Drive(Protocol):
         """Request closed loop control on both axes; `status` shows when it is reached.
 
         Args:
-            onboard: True for the motors' own position loop (`write`), with no gains at
-                first; False for torques only (`write_torque`).
+            onboard: True for the motors' own position loop (`write`), with zero gains at first;
+                False for torques only (`write_torque`).
         """
 
     def clear_errors(self) -> None:
-        """Clear both axes' errors; one that is still there comes back, an encoder's in 51 ms."""
+        """Clear both axes' errors; a persistent error returns, an encoder's within 51 ms."""
 
     def idle(self) -> None:
-        """Ask both axes to go idle."""
+        """Command both axes to go idle."""
 
     def set_position(self, turns: Pair) -> None:
-        """Write both motors' position, turns; only while they are idle.
+        """Write both motors' positions, turns, while they are idle; not for the control path.
 
         Raises:
-            DriveError: the drive does not take it. Not for the control path.
+            DriveError: the drive does not accept them.
         """
 
     def close(self) -> None:

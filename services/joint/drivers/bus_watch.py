@@ -1,17 +1,17 @@
-"""What a CAN link knows of its bus: is the drive heard, are our frames carried. Pure.
+"""State of a CAN bus: whether the drive sends, and whether own frames are carried. Pure.
 
-A controller repeats its frame until some node acknowledges it. On a bus whose nodes have no power
-it does so for ever: later frames wait behind it in the adapter, the interface's queue and the
-socket, and all of them reach the drive when its power is back. The kernel drops none for its age.
-So the link hands over no frame that might have to wait:
+A CAN controller repeats its frame until some node acknowledges it. On a bus whose nodes have no
+power, it repeats without end: later frames wait behind it in the adapter, the interface's queue and
+the socket, and all of them reach the drive when its power is back. The kernel drops none for its
+age. So the link sends no frame that might have to wait:
 
-- nothing goes out unless the drive was heard within `QUIET_MS`;
-- nothing goes out while an own frame has not come back (CAN_RAW_RECV_OWN_MSGS: the adapter has
+- it sends nothing unless the drive was heard within `QUIET_MS`;
+- it sends nothing while an own frame has not come back (CAN_RAW_RECV_OWN_MSGS: the adapter has
   transmitted it) within `STUCK_MS`;
-- what has not come back within `RESTART_MS` is thrown away, by a restart of the interface;
+- a restart of the interface discards frames that have not come back within `RESTART_MS`;
 - an arming request needs an own frame that was carried within `PROOF_MS`.
 
-After an outage one harmless frame, the probe, has to be carried before anything else goes out.
+After an outage, one harmless frame, the probe, must be carried before anything else is sent.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from shared.clock import NS_PER_MS
 QUIET_MS: Final = 20
 """Silence of the drive after which nothing is sent: ten of its encoder frames at 2 ms."""
 STUCK_MS: Final = 15
-"""Time by which an own frame is carried on any live bus: a queue of 100 frames takes 13 ms."""
+"""Time within which any live bus carries an own frame: a queue of 100 frames takes 13 ms."""
 RESTART_MS: Final = 30
-"""Age at which frames that were not carried are thrown away: with a cycle of 5 ms and the restart
-itself none becomes 50 ms old."""
+"""Age at which frames that were not carried are discarded: with a cycle of 5 ms and the restart
+itself, none becomes 50 ms old."""
 ASK_AFTER_NS: Final = 4 * NS_PER_MS
-"""Age of an own frame from which `xrl_unix` is asked whether the bus has carried it: asking is a
-system call."""
+"""Age of an own frame from which the link queries `xrl_unix` whether the bus has carried it, ns:
+the query is a system call."""
 PROOF_MS: Final = 50
 """An arming request goes only to a bus that has carried an own frame within this time."""
 PROBE_MS: Final = 100
-"""Time between two probes of a bus that acknowledges nothing, though the drive is heard."""
+"""Time between two probes of a bus that acknowledges nothing although the drive is heard."""
 BLOCKED_MS: Final = 100
-"""Time without a carried frame, after one was refused (ENOBUFS) or thrown away, after which a drive
+"""Time without a carried frame, after one was refused (ENOBUFS) or discarded, after which a drive
 that is heard counts as lost."""
 
 _QUIET_NS: Final = QUIET_MS * NS_PER_MS
@@ -45,16 +45,16 @@ _NEVER: Final = -(1 << 62)
 
 
 class BusWatch:
-    """Keeps when the drive was heard, and which own frames have not been carried yet.
+    """Tracks when the drive was last heard, and which own frames have not been carried yet.
 
     Attributes:
-        echoes: the interface hands own frames back once they are carried. Without that the bus
-            counts as carrying what it takes, and hearing the drive is all the proof there is.
-        unacknowledged: own frames were not carried, and none has been since.
+        echoes: True if the interface hands own frames back once they are carried. Otherwise every
+            frame that the bus accepts counts as carried, and hearing the drive is the only proof.
+        unacknowledged: True from when own frames were not carried until one is.
     """
 
     def __init__(self, *, echoes: bool) -> None:
-        """Begin with a bus on which nothing was heard."""
+        """Start with a bus on which nothing was heard."""
         self.echoes = echoes
         self.unacknowledged = False
         self._heard_ns = self._carried_ns = self._probed_ns = _NEVER
@@ -62,26 +62,26 @@ class BusWatch:
         self._waiting: deque[int] = deque()
         self._can_restart = True
 
-    def heard(self, now_ns: int) -> None:
-        """Take in that a frame of the drive has come."""
+    def received(self, now_ns: int) -> None:
+        """Record a frame of the drive."""
         self._heard_ns = now_ns
         if not self.echoes:
             self.carried(now_ns)
 
     def sent(self, now_ns: int) -> None:
-        """Take in that the bus has taken an own frame that it is to hand back."""
+        """Record that the bus accepted an own frame, which it must hand back."""
         if self.echoes:
             self._waiting.append(now_ns)
 
     def refused(self, now_ns: int) -> None:
-        """Take in that the bus had no room for a frame."""
+        """Record that the bus had no room for a frame."""
         self._blocked_ns = self._blocked_ns or now_ns
 
     def carried(self, now_ns: int) -> None:
-        """Take in that an own frame has come back, or one that shows that it was carried.
+        """Record an own frame that came back, or one that shows that it was carried.
 
-        Frames are carried in order, so what was sent long before has been too, even if its echo was
-        lost in a full receive buffer.
+        Frames are carried in order, so frames sent long before were carried too, even if their
+        echoes were lost in a full receive buffer.
         """
         self._carried_ns = now_ns
         self._blocked_ns = 0
@@ -93,7 +93,7 @@ class BusWatch:
             waiting.popleft()
 
     def is_heard(self, now_ns: int) -> bool:
-        """Return True if the drive was heard just now."""
+        """Return True if the drive was heard within `QUIET_MS`."""
         return now_ns - self._heard_ns <= _QUIET_NS
 
     def may_send(self, now_ns: int) -> bool:
@@ -104,11 +104,11 @@ class BusWatch:
         return not waiting or now_ns - waiting[0] <= _STUCK_NS
 
     def may_arm(self, now_ns: int) -> bool:
-        """Return True if the bus has just carried a frame as well."""
+        """Return True if, in addition, the bus has carried a frame within `PROOF_MS`."""
         return self.may_send(now_ns) and now_ns - self._carried_ns <= PROOF_MS * NS_PER_MS
 
     def carries_nothing(self, now_ns: int) -> bool:
-        """Return True if for `BLOCKED_MS` no own frame was carried that the bus was to carry."""
+        """Return True if the bus has carried no own frame for `BLOCKED_MS` although it should."""
         return bool(self._blocked_ns) and now_ns - self._blocked_ns > BLOCKED_MS * NS_PER_MS
 
     @property
@@ -117,27 +117,27 @@ class BusWatch:
         return bool(self._waiting)
 
     def heard_in_order(self, now_ns: int) -> bool:
-        """As `heard`; return True if the bus needs nothing else of the link in this cycle."""
+        """As `heard`; return True if the bus needs no other action of the link in this cycle."""
         if not self.echoes:
-            self.heard(now_ns)
+            self.received(now_ns)
             return True
         self._heard_ns = now_ns
         waiting = self._waiting
         return not self.unacknowledged and (not waiting or now_ns - waiting[0] < ASK_AFTER_NS)
 
     def waited_ns(self, now_ns: int) -> int:
-        """Return the age of the oldest own frame that has not come back; 0: all have."""
+        """Return the age of the oldest own frame that has not come back, ns; 0 if all have."""
         return now_ns - self._waiting[0] if self._waiting else 0
 
     def restart_due(self, now_ns: int) -> bool:
-        """Return True if frames wait that must not reach the drive any more."""
+        """Return True if waiting frames must no longer reach the drive."""
         waiting = self._waiting
         return bool(waiting) and now_ns - waiting[0] > RESTART_MS * NS_PER_MS
 
     def restarted(self, now_ns: int, *, done: bool) -> None:
-        """Take in that the interface was restarted, or that this process may not do so.
+        """Record that the interface was restarted, or that this process is not allowed to.
 
-        In that case the frames stay, at most those of `STUCK_MS`, and a silent bus is not probed.
+        Without a restart the frames stay, at most those of `STUCK_MS`, and no silent bus is probed.
         """
         self.unacknowledged = True
         self.refused(now_ns)
@@ -145,10 +145,10 @@ class BusWatch:
         self._waiting.clear()
 
     def probe_due(self, now_ns: int) -> bool:
-        """Return True if a probe is to show whether the bus carries frames, and count it as sent.
+        """Return True if a probe is due, and count it as sent.
 
-        Of a bus that has carried nothing: as soon as the drive is heard, then every `PROBE_MS`.
-        Of a bus that is silent: once, so that it is known whether nobody is there.
+        A bus that has carried nothing is probed as soon as the drive is heard, then every
+        `PROBE_MS`. A silent bus is probed once, to find out whether any node is there.
         """
         if not self.echoes or self._waiting or now_ns - self._probed_ns < PROBE_MS * NS_PER_MS:
             return False
@@ -163,6 +163,6 @@ class BusWatch:
         return True
 
     def reopened(self) -> None:
-        """Begin with a newly opened bus; whatever waits from before shows by the next frame."""
+        """Start over with a newly opened bus; the next frame shows whether old ones still wait."""
         self._waiting.clear()
         self._blocked_ns = 0

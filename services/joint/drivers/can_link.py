@@ -1,4 +1,4 @@
-"""A CAN link by python-can as the drivers use it: it never blocks, never raises, comes back."""
+"""CAN link over python-can, for the drivers: it never blocks or raises, and reconnects."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
 
 FRAMES_PER_READ: Final = 512
-"""More than can wait in a socket; a flooded bus must not hold up the loop."""
+"""More frames than a socket holds; a flooded bus must not hold up the loop."""
 RETRY_MS: Final = 200
-"""Between two attempts to open the bus: on socketcan an attempt may cost a millisecond."""
+"""Time between two attempts to open the bus, ms: on socketcan an attempt may cost 1 ms."""
 COMMANDS_MS: Final = 40
-"""An order that the bus has not taken by then is given up: it belongs to another moment."""
+"""Time after which a command that the bus has not accepted is dropped as outdated, ms."""
 ECHOING: Final = ("socketcan", "xrl_unix")
 """Interfaces that hand own frames back once the bus has carried them."""
 ECHOED: Final = (Command.SET_INPUT_POS, Command.SET_INPUT_TORQUE, Command06.GET_VERSION)
-"""Commands to axis0 that are awaited back: each row that a driver sends has one of them."""
+"""Commands to axis0 whose echo is awaited: each row that a driver sends has one of them."""
 HEARD: Final = (
     Command.HEARTBEAT,
     Command.GET_ENCODER_ESTIMATES,
@@ -48,10 +48,10 @@ HEARD: Final = (
     Command.GET_VBUS,
     Command06.GET_TEMPERATURE,
 )
-"""Commands whose frames are the drive's own: it is there, and the kernel lets them through."""
+"""Commands that the drive sends: they show that it is there, and pass the kernel's filter."""
 IN_KERNEL: Final = ("socketcan",)
-"""Interfaces whose frames all wait in the kernel, behind one file descriptor: it throws other
-modules' frames away before a process is woken for them, and is waited for by `select`."""
+"""Interfaces whose frames all wait in the kernel, behind one file descriptor for `select`. The
+kernel drops other modules' frames before it wakes a process for them."""
 
 BUS_OFF: Final = 0x40
 """Class of an error frame (linux/can/error.h): the controller has left the bus."""
@@ -59,7 +59,7 @@ BUS_OFF: Final = 0x40
 Receive: TypeAlias = Callable[[float], bytes]
 """Waits for at most the given seconds and returns all received frames, packed."""
 Send: TypeAlias = Callable[[bytes], int]
-"""Takes packed frames; returns how many bytes of them, from the first, the bus has taken."""
+"""Sends packed frames; returns how many bytes, from the first, the bus has accepted."""
 
 
 def packed(node_id: int, command: int, data: bytes) -> bytes:
@@ -73,20 +73,20 @@ def request_of(node_id: int, command: int) -> bytes:
 
 
 class CanLink:
-    """A bus that may not be there: what goes wrong on it is counted, and reads as silence.
+    """A bus that may be absent: its failures are counted, and read as silence.
 
-    A bus that fails, or whose controller has gone off it (too many errors on the wire), is
-    closed, and opened again every `RETRY_MS`. Nothing is sent that would have to wait for somebody
-    to acknowledge it (`services.joint.drivers.bus_watch`).
+    A bus that fails, or whose controller has gone bus-off (too many errors on the wire), is closed,
+    and reopened with an attempt every `RETRY_MS`. No frame is sent that would have to wait for a
+    node to acknowledge it (`services.joint.drivers.bus_watch`).
 
     Attributes:
-        watch: what is known of the bus.
-        bus_offs: how often the controller went off the bus.
-        error_frames: reports of any other trouble on the wire.
+        watch: state of the bus.
+        bus_offs: number of times that the controller went bus-off.
+        error_frames: number of reports of any other trouble on the wire.
     """
 
     def __init__(self, config: CanConfig, node_ids: Sequence[int]) -> None:
-        """Take the channel with `{run}` already expanded, and the nodes to listen to."""
+        """Set the bus, with `{run}` in its channel already expanded, and the nodes to listen to."""
         self.bus_offs = 0
         self.error_frames = 0
         self._config = config
@@ -118,7 +118,7 @@ class CanLink:
         return self._bus is not None
 
     def connect(self) -> bool:
-        """Open the bus, not more often than every `RETRY_MS`; return True if it was.
+        """Open the bus, at most once every `RETRY_MS`; return True if it was opened.
 
         Raises:
             DriveError: python-can does not know the interface.
@@ -137,7 +137,7 @@ class CanLink:
         except NotImplementedError as error:
             raise DriveError(
                 f"CAN interface {self._config.interface!r}: {error}; "
-                "use one that python-can knows, such as socketcan or xrl_unix"
+                "use an interface that python-can knows, such as socketcan or xrl_unix"
             ) from error
         except (can.CanError, OSError):
             return False
@@ -151,9 +151,9 @@ class CanLink:
         return True
 
     def receive(self, timeout_s: float) -> list[Frame]:
-        """Return the frames of one wait; none, too, if the bus failed, which closes it.
+        """Return the frames of one wait; empty, too, if the bus failed, which closes it.
 
-        Error frames are among them: they are for `error_frame`.
+        Error frames are among them, for `error_frame`.
         """
         frames = unpack_frames(self.receive_packet(timeout_s))
         self.take_in(frames, now_ns())
@@ -174,46 +174,46 @@ class CanLink:
         return packet
 
     def take_in(self, frames: Sequence[Frame], now: int) -> None:
-        """Take in what frames show of the bus; throw away what must not wait any longer."""
+        """Update the state of the bus from frames; discard frames that must no longer wait."""
         watch = self.watch
         for can_id, _ in frames:
             if can_id in self._drives:
-                watch.heard(now)
+                watch.received(now)
             elif can_id in self._own:
                 watch.carried(now)
         self._look_after(now)
 
     def hear_drive(self, now: int) -> None:
-        """As `take_in`, of frames that are all the drive's."""
+        """As `take_in`, for frames that are all the drive's."""
         if not self.watch.heard_in_order(now) or self._commands or self._greeting:
             self._look_after(now)
 
     def error_frame(self, can_id: int) -> None:
-        """Take in an error frame: a bus that is off is closed."""
+        """Process an error frame; after a bus-off the bus is closed."""
         if can_id & BUS_OFF:
             self._go_off()
         else:
             self.error_frames += 1
 
     def send(self, packet: bytes, awaited: int = 0) -> bool:
-        """Hand frames to the bus; False if it did not take them all.
+        """Send frames; return False if the bus did not accept them all.
 
-        What waits by `order` goes first; until it has gone, nothing else goes.
+        Frames that wait from `order` are sent first; nothing else is sent before them.
 
         Args:
             packet: the frames.
-            awaited: how many of them are `ECHOED` ones to axis0.
+            awaited: number of `ECHOED` frames to axis0 among them.
         """
         if self._commands and not self._send_commands():
             return False
-        # A full queue comes here too. A dead link shows in receiving.
+        # This covers a full queue, too. A dead link shows when receiving.
         return self._hand_over(packet, awaited, now_ns()) == len(packet)
 
     def greet(self, packet: bytes) -> None:
         """Send the first requests on a newly opened bus.
 
-        They go before the drive was heard: whether they are carried shows if anybody is there, and
-        whether frames wait from an earlier process. After an outage they wait for the drive.
+        They are sent before the drive was heard: their echoes show whether any node is there, and
+        whether frames of an earlier process wait. After an outage they wait for the drive.
         """
         if self.watch.unacknowledged:
             self._greeting = packet
@@ -222,16 +222,16 @@ class CanLink:
             self._send_probe(now_ns())
 
     def order(self, packet: bytes, *, proven: bool = False) -> None:
-        """Send frames of which none may be missing, in this order.
+        """Send frames in this order, and all of them.
 
-        A row of a dozen can be longer than the queue of the interface (ten frames, unless
-        set): the rest follows when there is room, within `COMMANDS_MS`. They take the place
-        of an order that is still waiting.
+        A dozen frames can be more than the queue of the interface holds (ten frames, unless set).
+        The rest follows when there is room, within `COMMANDS_MS`. The frames replace a command that
+        is still waiting.
 
         Args:
-            packet: the row.
-            proven: send it only once the bus has just carried a frame: an arming request that had
-                to wait would arm a drive at another time.
+            packet: the frames.
+            proven: send them only once the bus has just carried a frame: a delayed arming request
+                would arm a drive at the wrong time.
         """
         if self._bus is None:
             return
@@ -241,7 +241,7 @@ class CanLink:
         self._send_commands()
 
     def close(self) -> None:
-        """Leave the bus for good."""
+        """Close the bus for good."""
         self._disconnect()
         self._retry_at_ns = 1 << 63
 
@@ -257,7 +257,7 @@ class CanLink:
         return not self._commands
 
     def _hand_over(self, packet: bytes, awaited: int, now: int) -> int:
-        """Hand frames to the bus if they would not wait there; return the bytes that it took."""
+        """Send frames if they would not have to wait; return the bytes that the bus accepted."""
         watch = self.watch
         if not watch.may_send(now):
             return 0
@@ -266,7 +266,7 @@ class CanLink:
             return taken
         if taken < len(packet):
             awaited = self._awaited(packet[:taken])
-            # a question that found no room shows nothing: later ones do, and none comes back
+            # a request that found no room shows nothing: it has no echo, and later frames show more
             if not all(can_id & REMOTE_FLAG for can_id, _ in unpack_frames(packet[taken:])):
                 watch.refused(now)
         for _ in range(awaited):
@@ -274,16 +274,16 @@ class CanLink:
         return taken
 
     def _awaited(self, packet: bytes) -> int:
-        """Return how many frames of a packet are awaited back."""
+        """Return how many frames of a packet have an awaited echo."""
         return sum(can_id in self._own for can_id, _ in unpack_frames(packet))
 
     def _send_probe(self, now: int) -> None:
-        """Send a frame that changes nothing: that it comes back shows that the bus carries."""
+        """Send a frame that changes nothing; its echo shows that the bus carries frames."""
         if self._send(self._probe):
             self.watch.sent(now)
 
     def _look_after(self, now: int) -> None:
-        """Ask what the bus has carried; restart, probe or greet it if that is due."""
+        """Query what the bus has carried; restart, probe or greet it if that is due."""
         watch = self.watch
         if self._bus is None:
             return
@@ -301,7 +301,7 @@ class CanLink:
             self._send(greeting)
 
     def _restart(self) -> None:
-        """Throw away what waits in the kernel and the adapter, of whatever process."""
+        """Discard what waits in the kernel and the adapter, of any process."""
         self._commands = b""
         done = True
         try:
@@ -316,7 +316,7 @@ class CanLink:
         self._retry_at_ns = now_ns() + RETRY_MS * NS_PER_MS
 
     def _disconnect(self) -> None:
-        """Close the bus; what waited for it is not for the next one."""
+        """Close the bus, and drop what waited for it."""
         if self._bus is not None:
             with suppress(can.CanError, OSError):
                 self._bus.shutdown()
@@ -328,9 +328,9 @@ class CanLink:
 
 
 def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
-    """Return python-can's filters for what drives send, and for own frames that are awaited back.
+    """Return python-can's filters for drives' frames and own frames whose echo is awaited.
 
-    Error frames pass them.
+    Error frames pass the filters.
     """
     mask = cansimple.arbitration_id(cansimple.NODE_MASK, cansimple.COMMAND_MASK)
     wanted = [(node, command) for node in node_ids for command in (*HEARD, Command06.GET_VERSION)]
@@ -346,10 +346,10 @@ def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
 
 
 def receiver(bus: can.BusABC, *, in_kernel: bool) -> Receive:
-    """Return how to receive from a bus: one wait, then all that is there.
+    """Return a function that waits once on a bus, then receives all frames that are there.
 
-    A bus of the kernel is read at its socket: python-can makes an object of each frame, and waits
-    by the wall clock, so that one set back on a silent bus (NTP) would hold up the loop.
+    A kernel bus is read at its socket: python-can creates an object for each frame, and waits by
+    the wall clock. On a silent bus, a clock that is set back (NTP) would hold up the loop.
     """
     if isinstance(bus, UnixCanBus):
         return bus.recv_packet
@@ -385,7 +385,7 @@ def receiver(bus: can.BusABC, *, in_kernel: bool) -> Receive:
 
 
 def sender(bus: can.BusABC, *, in_kernel: bool) -> Send:
-    """Return how to send several frames on a bus; one that it does not take ends the row."""
+    """Return a function that sends several frames, up to the first that the bus does not accept."""
     if isinstance(bus, UnixCanBus):
         return bus.send_packet
     raw = getattr(bus, "socket", None) if in_kernel else None
@@ -408,7 +408,7 @@ def sender(bus: can.BusABC, *, in_kernel: bool) -> Send:
 
 
 def _message(frame: bytes) -> can.Message:
-    """Return a packed frame as python-can has it."""
+    """Convert a packed frame to python-can's message."""
     ((can_id, data),) = unpack_frames(frame)
     remote = bool(can_id & REMOTE_FLAG)
     return can.Message(

@@ -1,17 +1,17 @@
 """Reports of an ODrive's two axes over CANSimple, of either firmware. Pure.
 
-Firmware 0.5 and 0.6 share set-points, gains, limits, estimates and the axis state in byte 4 of
-a heartbeat. They differ in its other bytes and in the numbers of the errors. The
-firmware is detected, not configured:
+Firmware 0.5 and 0.6 share setpoints, gains, limits, estimates and the axis state in byte 4 of a
+heartbeat. They differ in the other bytes and in the error numbers. The firmware is detected, not
+configured:
 
-- 0.6 answers a request for its version (0x000); on 0.5 the same frame feeds the watchdog.
-- Byte 7 of a heartbeat is reserved in 0.6, and 0.5 sets its top bit while no trajectory runs.
-- Byte 5 is a flag in 0.5; a procedure result of 2 and more can only be 0.6.
+- 0.6 answers a request for its version (0x000); on 0.5, the same frame feeds the watchdog.
+- Byte 7 of a heartbeat is reserved in 0.6; 0.5 sets its top bit while no trajectory runs.
+- Byte 5 is a flag in 0.5; a procedure result of 2 or more can only be 0.6.
 - A drive that leaves `UNANSWERED` requests without an answer counts as 0.5. If it is 0.6 after all,
 its heartbeats look like errors, and its next answer corrects that.
 
-The other way round would be dangerous: byte 5 of 0.6 says "busy" where 0.5 says that the motor
-failed. So a drive counts as 0.6 on evidence only.
+The opposite mistake would be dangerous: byte 5 of 0.6 says "busy" where 0.5 says that the motor
+failed. So a drive counts as 0.6 only on evidence.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ Dialect = Literal["", "0.5", "0.6"]
 HEARTBEAT_BYTES: Final = 8
 VERSION_BYTES: Final = 8
 UNANSWERED: Final = 10
-"""Number of version requests, one for each heartbeat that shows no firmware: not all of them get
-lost."""
+"""Number of version requests, one for each heartbeat that does not show the firmware: they are not
+all lost."""
 
 OTHER_ERROR: Final = 0x8000_0000
-"""An error that `AxisError` has no name for, or of a drive whose dialect is not known yet."""
+"""An error without a name in `AxisError`, or of a drive whose dialect is not known yet."""
 
 _UNHEARD: Final = -1
 _FINE: Final = (ProcedureResult.SUCCESS, ProcedureResult.BUSY, ProcedureResult.CANCELLED)
@@ -67,9 +67,9 @@ _NAMED_06: Final = sum(error for error, _ in _FROM_06)
 
 
 def errors_from_06(errors: int) -> int:
-    """Return 0.6's errors as `AxisError` bits; what has no counterpart is `OTHER_ERROR`.
+    """Return 0.6's errors as `AxisError` bits; without a counterpart, `OTHER_ERROR`.
 
-    No error ever becomes no error.
+    Every error becomes at least one bit.
     """
     if not errors:
         return 0
@@ -90,18 +90,18 @@ def dialect_of(heartbeat: bytes) -> Dialect:
 def judged(dialect: Dialect, heartbeat: bytes, *, wanted_armed: bool) -> tuple[int, int]:
     """Return an axis's state and its errors, `AxisError` bits and `OTHER_ERROR`.
 
-    Out of closed loop that was not requested, a watchdog that ran out only shows that nothing was
-    written yet. While the dialect is unknown, every possible error counts as one.
+    Outside closed loop, if that was not requested, an expired watchdog only shows that nothing was
+    written yet. While the dialect is unknown, every possible error counts as an error.
 
     Args:
-        dialect: which firmware speaks.
+        dialect: the firmware's generation.
         heartbeat: its eight bytes.
-        wanted_armed: closed loop was asked for, and IDLE not since.
+        wanted_armed: True if closed loop was requested, and IDLE not since.
     """
     state = heartbeat[4]
     closed = state == AxisState.CLOSED_LOOP_CONTROL
     if dialect == "":
-        # In closed loop bytes 5 and 6 are no errors in either: an axis with one disarms.
+        # In closed loop, bytes 5 and 6 are not errors in either: an axis with an error disarms.
         suspect = any(heartbeat[:4]) or (not closed and any(heartbeat[5:]))
         return state, OTHER_ERROR if suspect else 0
     if dialect == "0.5":
@@ -110,7 +110,7 @@ def judged(dialect: Dialect, heartbeat: bytes, *, wanted_armed: bool) -> tuple[i
         fields = cansimple_06.unpack_heartbeat(heartbeat)
         errors = errors_from_06(fields.axis_error)
         if wanted_armed and not closed and fields.procedure_result not in _FINE:
-            errors |= AxisError.INVALID_STATE  # asked for, and refused or ended
+            errors |= AxisError.INVALID_STATE  # requested, and refused or ended
     if not closed and not wanted_armed:
         errors &= ~AxisError.WATCHDOG_TIMER_EXPIRED
     return state, int(errors)
@@ -124,7 +124,7 @@ class AxesReport:
 
     Attributes:
         dialect: "" until it is known.
-        status: by the last heartbeats.
+        status: from the last heartbeats.
     """
 
     def __init__(self) -> None:
@@ -143,7 +143,7 @@ class AxesReport:
         return self._errors[0] | self._errors[1]
 
     def forget(self) -> None:
-        """Forget both axes until they have sent a heartbeat: it may be another drive by now."""
+        """Forget both axes until they have sent a heartbeat: the drive may be another one."""
         self.dialect = ""
         self._unanswered = 0
         self._discard_reports()
@@ -158,7 +158,7 @@ class AxesReport:
         self.status = DriveStatus.IDLE
 
     def receive(self, axis: int, heartbeat: bytes) -> None:
-        """Take in a heartbeat of axis 0 or 1 and judge again."""
+        """Process a heartbeat of axis 0 or 1, and update the status."""
         self._heartbeats[axis] = heartbeat
         if self.dialect == "":
             self._unanswered += 1
@@ -172,7 +172,7 @@ class AxesReport:
         self._judge()
 
     def receive_version(self) -> None:
-        """Take an answer to 0x000; earlier heartbeats are judged again if needed."""
+        """Process an answer to 0x000; earlier heartbeats are judged again if needed."""
         if self.dialect != "0.6":
             self._learn("0.6")
 

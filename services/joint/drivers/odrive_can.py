@@ -1,7 +1,7 @@
 """One ODrive over CANSimple and python-can (docs/drives.md).
 
-The same code on the robot (socketcan) and in the demo (`xrl_unix`): only the configured
-interface and channel differ. It speaks to firmware 0.5 and 0.6 (`services.joint.drivers.firmware`).
+The same code runs on the robot (socketcan) and in the demo (`xrl_unix`); only the configured
+interface and channel differ. It supports firmware 0.5 and 0.6 (`services.joint.drivers.firmware`).
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from shared.config.sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 
 FRESH_S: Final = 0.05
-"""Time for which `set_position` waits for a frame of the drive, which is not sent to unheard."""
+"""Time for which `set_position` waits for a frame of the drive, s: a silent one gets nothing."""
 CLOSE_MS: Final = 20
-"""Time for which a command that the bus had no room for may hold up `close`."""
+"""Time for which a command that the bus had no room for may delay `close`, ms."""
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _LOST, _ARMED = DriveStatus.LOST, DriveStatus.ARMED
@@ -59,15 +59,15 @@ _PAIR_BYTES: Final = 8
 class OdriveCan:
     """Both axes of one ODrive; implements `services.joint.drivers.base.Drive`.
 
-    The bus may be absent: until it is there, and whenever it goes away, the status is LOST and
-    reading retries by itself. The status stays LOST until both axes have sent a heartbeat, because
-    only that shows their state. Frames lost on the way to the drive are counted, not raised.
+    While the bus is absent, the status is LOST and `read` retries to open it. The status stays LOST
+    until both axes have sent a heartbeat, because only that shows their state. Frames lost on the
+    way to the drive are counted, not raised.
 
-    `DriveReading.error` holds `AxisError` bits for either firmware; errors of 0.6 map to
-    the bit of the same meaning, others to `OTHER_ERROR`.
+    `DriveReading.error` holds `AxisError` bits for either firmware; errors of 0.6 map to the bit of
+    the same meaning, all others to `OTHER_ERROR`.
 
     Attributes:
-        write_failures: torque pairs and targets that the bus did not take.
+        write_failures: torque pairs and targets that the bus did not accept.
     """
 
     def __init__(
@@ -78,11 +78,11 @@ class OdriveCan:
         *,
         encoder_counts_per_turn: int | None = None,
     ) -> None:
-        """Take the channel with `{run}` already expanded; open the bus if it is there.
+        """Open the bus if it is there; `{run}` in its channel must already be expanded.
 
         Args:
             can_config: the bus; other modules may be on it too.
-            node_ids: of axis0 and axis1.
+            node_ids: CAN nodes of axis0 and axis1.
             drive: limits and timing.
             encoder_counts_per_turn: for `set_position` on firmware 0.5, which takes counts.
 
@@ -94,7 +94,7 @@ class OdriveCan:
         self._drive = drive
         self._counts_per_turn = encoder_counts_per_turn
         self._rows = Rows(node_ids, drive)
-        # The firmware takes it as food for the watchdog, and 0.6 tells its version besides.
+        # It feeds the firmware's watchdog; firmware 0.6 also answers with its version.
         self._food = b"".join(packed(n, Command06.GET_VERSION, b"") for n in node_ids)
         self._pair_ids = tuple(
             cansimple.arbitration_id(n, Command.GET_ENCODER_ESTIMATES) for n in node_ids
@@ -133,8 +133,8 @@ class OdriveCan:
     def read(self, timeout_s: float) -> DriveReading | None:
         """Wait for the next encoder sample of both axes; see `Drive.read`.
 
-        All frames that wait are read and the newest of each axis wins. A reading with
-        status LOST repeats the last sample and its time.
+        All waiting frames are read, and the newest of each axis wins. A reading with status LOST
+        repeats the last sample and its time.
         """
         link = self._link
         now = now_ns()
@@ -170,7 +170,7 @@ class OdriveCan:
         return self._reading(status)
 
     def write_torque(self, torque: Pair) -> None:
-        """Send both motor torques, N m, at most `current_lim`'s worth; not a number is zero."""
+        """Send both motor torques, N m, clipped to `current_lim`; NaN is sent as zero."""
         settles = self._due.with_torques(now_ns())
         if not self._link.send(self._rows.torques(torque, settles=settles), awaited=1):
             self.write_failures += 1
@@ -180,8 +180,8 @@ class OdriveCan:
     def write(self, target: MotorTarget) -> None:
         """Send the target of both motors' own loops; gains before the values they act on.
 
-        A target that is not finite is not sent: the drive keeps the last one. Over CAN
-        velocity and torque travel in thousandths: 0.035 N m at the joint.
+        A target that is not finite is not sent, so the drive keeps the last one. CAN carries
+        velocity and torque in thousandths: 0.035 N m at the joint.
         """
         if not self._link.is_open or not is_target(target):
             self.write_failures += 1
@@ -189,15 +189,15 @@ class OdriveCan:
         row = self._due.with_target((target.pos_gain, target.vel_gain), now_ns())
         if not self._link.send(self._rows.target(row, target, self._first), awaited=1):
             self.write_failures += 1
-            self._first ^= 1  # what is cut off again is then the other axis's
+            self._first ^= 1  # a full queue would next cut off the other axis
             self._due.cut_off(row)
 
     def arm(self, *, onboard: bool) -> None:
         """Request closed loop control on both axes; see `Drive.arm`.
 
-        Errors are cleared, and `input_torque` and the gains zeroed first: re-arming would
+        Errors are cleared, and `input_torque` and the gains are zeroed first: re-arming would
         otherwise bring back the earlier torque, and the factory gains have an integrator. `status`
-        is IDLE until heartbeats show more.
+        is IDLE until heartbeats show another state.
         """
         self._send(odrive_frames.arming(self._drive, onboard=onboard), armed=True, proven=True)
         now = now_ns()
@@ -205,7 +205,7 @@ class OdriveCan:
         self._windows.armed(now)
 
     def idle(self) -> None:
-        """Ask both axes to go idle, with their input torque zeroed."""
+        """Command both axes to go idle, with their input torque zeroed."""
         self._send(odrive_frames.IDLING, armed=False)
         self._windows.idle(now_ns())
         self._due.idle()
@@ -215,25 +215,25 @@ class OdriveCan:
         self._link.send(odrive_frames.packet_of(self._node_ids, odrive_frames.CLEARING))
 
     def set_position(self, turns: Pair) -> None:
-        """Write both motors' position, turns; see `Drive.set_position`.
+        """Write both motors' positions, turns; see `Drive.set_position`.
 
         Raises:
             DriveError: the firmware is unknown, the counts per turn are missing, or the bus is
                 full.
         """
         frames = odrive_frames.positions(self._node_ids, turns, self.dialect, self._counts_per_turn)
-        if not self._link.watch.is_heard(now_ns()):  # a person was asked meanwhile
+        if not self._link.watch.is_heard(now_ns()):  # a question to a person took time
             self._pump(0.0)
             self._pump(FRESH_S)
         if not self._link.send(frames):
             first, second = self._node_ids
             raise DriveError(
-                f"CAN nodes {first} and {second}: the bus took no order; look at its wiring, and "
-                "whether its interface is up"
+                f"CAN nodes {first} and {second}: the bus did not accept the command; check its "
+                "wiring, and whether its interface is up"
             )
 
     def close(self) -> None:
-        """Release the bus and stay away from it; an order that waits has `CLOSE_MS` to go."""
+        """Release the bus for good; a waiting command has `CLOSE_MS` to be sent."""
         deadline = now_ns() + CLOSE_MS * NS_PER_MS
         while not self._link.send(b"") and self._link.is_open and now_ns() < deadline:
             time.sleep(1e-3)
@@ -253,10 +253,10 @@ class OdriveCan:
         self._link.order(odrive_frames.packet_of(self._node_ids, commands), proven=proven)
 
     def _pump(self, timeout_s: float) -> int:
-        """Take in the frames of one wait; most of a shared bus's are other modules'.
+        """Process the frames of one wait; on a shared bus most are other modules'.
 
         Returns:
-            when they were received, ns.
+            time at which they were received, ns.
         """
         link, takers = self._link, self._takers
         packet = link.receive_packet(max(0.0, timeout_s))
@@ -285,7 +285,7 @@ class OdriveCan:
             return False
         counted = self._answers.counted
         counted[0] = counted[1] = None
-        self._encoders.take_both(first, second, now)
+        self._encoders.store_both(first, second, now)
         return True
 
     def _take_estimates(self, axis: int, data: bytes) -> None:
@@ -297,7 +297,7 @@ class OdriveCan:
                 estimate = answers.counted[axis] or estimate
             else:
                 answers.counted[axis] = None
-            self._encoders.take(axis, estimate, self._times.now_ns)
+            self._encoders.store(axis, estimate, self._times.now_ns)
 
     def _take_heartbeat(self, axis: int, data: bytes) -> None:
         times, windows = self._times, self._windows
@@ -306,7 +306,7 @@ class OdriveCan:
             return
         times.heard_ns[axis] = now
         if now < windows.insist_until_ns and data[4] == AxisState.CLOSED_LOOP_CONTROL:
-            self._send(odrive_frames.IDLING, armed=False)  # it was lost on the way
+            self._send(odrive_frames.IDLING, armed=False)  # the idle command was lost
             return
         report = self._report
         report.receive(axis, bytes(data))
@@ -316,17 +316,16 @@ class OdriveCan:
             self._link.send(self._answers.ask_count[axis])
         found_armed = report.status is DriveStatus.ARMED and self._due.gains is None
         if found_armed and self._answers.torques is None:
-            self._link.send(self._answers.ask_currents)  # whoever takes it over asks for them
+            self._link.send(self._answers.ask_currents)  # a take-over needs them
 
     def _take_version(self, _axis: int, data: bytes) -> None:
-        if len(data) == VERSION_BYTES:  # a request that we or others sent has none
+        if len(data) == VERSION_BYTES:  # a request, from here or elsewhere, has no data
             self._report.receive_version()
 
     def _silence(self, now: int) -> DriveReading | None:
-        """Return None while the drive may yet come back as it was, then that it is lost.
+        """Return None during a short silence, then a reading with the drive lost.
 
-        A link that failed counts as silence too: an interface that restarts is not a lost
-        drive.
+        A failed link counts as silence too, because an interface that restarts is not a lost drive.
         """
         if self._times.has_recent_sample(now):
             return None
@@ -336,7 +335,7 @@ class OdriveCan:
         return self._reading(DriveStatus.UNACKNOWLEDGED if dead else DriveStatus.LOST)
 
     def _forget(self) -> None:
-        """Forget the drive's reports: it may have been switched off and on."""
+        """Forget the drive's reports: it may have been power-cycled."""
         self._report.forget()
         self._answers.forget_counts()
         self._answers.supply_v = 0.0
@@ -366,7 +365,7 @@ class OdriveCan:
         )
 
     def _connect(self) -> bool:
-        """Open the bus if it is time to; ask what firmware is there."""
+        """Open the bus if an attempt is due; request the firmware's version."""
         if not self._link.connect():
             return False
         self._encoders.forget()

@@ -1,6 +1,6 @@
 """CANSimple frames for an ODrive's two axes. Pure.
 
-They are the same for both firmwares except those that write a position.
+They are the same for both firmware generations, except frames that write a position.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ IDLING: Final[tuple[CanCommand, ...]] = (
     (Command.SET_AXIS_STATE, cansimple.pack_u32(AxisState.IDLE)),
 )
 CLEARING: Final[tuple[CanCommand, ...]] = ((Command.CLEAR_ERRORS, b"\0"),)
-"""0.6 takes a byte (whether to blink), 0.5 looks at none."""
+"""0.6 reads one byte (whether to blink); 0.5 ignores it."""
 
 
 def packet_of(nodes: Nodes, commands: tuple[CanCommand, ...]) -> bytes:
@@ -44,12 +44,12 @@ def packet_of(nodes: Nodes, commands: tuple[CanCommand, ...]) -> bytes:
 
 
 def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
-    """Return what leads to closed loop with no torque, and with no gains if onboard.
+    """Return the commands to closed loop without torque, and without gains if onboard.
 
-    Errors are cleared, and `input_torque` zeroed first: re-arming would otherwise bring back
-    the torque of before. In position mode the firmware itself sets input_pos to where it is;
-    the gains it ships with have an integrator, so they are zeroed too. In torque mode they
-    are left: by vel_gain the firmware limits the velocity, and with none all torque.
+    Errors are cleared and `input_torque` is zeroed first: re-arming would otherwise bring back the
+    earlier torque. In position mode the firmware itself sets input_pos to the present position; its
+    factory gains have an integrator, so they are zeroed too. In torque mode they stay: the firmware
+    limits the velocity with vel_gain, and a zero gain would suppress all torque.
     """
     no_gains = (
         (Command.SET_VEL_GAINS, cansimple.pack_two_floats(0.0, 0.0)),
@@ -68,10 +68,10 @@ def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
 class Rows:
     """Packs the frames that are sent in every cycle or often.
 
-    An axis's gains come right before the target that they belong to. Its stiffness is the product
-    of both, and where they change by much (DAMP) pos_gain falls: it goes first, or the stiffness
-    doubles in between. A mode that is set puts a 0.5 drive's input_pos to where the motor is: the
-    axis's own target follows at once.
+    An axis's gains come right before their target. Its stiffness is the product of both gains.
+    Where they change by much (DAMP), pos_gain falls and is sent first; otherwise the stiffness
+    would double in between. Setting a mode moves a 0.5 drive's input_pos to the motor's position,
+    so the axis's own target follows at once.
     """
 
     def __init__(self, nodes: Nodes, drive: DriveConfig) -> None:
@@ -90,9 +90,9 @@ class Rows:
         )  # fmt: skip
 
     def torques(self, torque: Pair, *, settles: bool) -> bytes:
-        """Pack torques, N m, within `current_lim`; one that is not finite becomes zero.
+        """Pack torques, N m, clipped to `current_lim`; NaN becomes zero.
 
-        `settles`: with the limits and modes that arming has sent.
+        `settles`: include the limits and modes that arming has sent.
         """
         most, (id_0, id_1) = self._torque_max, self._torque_ids
         first, second = (
@@ -109,10 +109,10 @@ class Rows:
         return self._limits + self._torque_mode + packet if settles else packet
 
     def target(self, row: GainRow, target: MotorTarget, first: int) -> bytes:
-        """Pack a target, and what goes out with it.
+        """Pack a target, and the frames that are sent with it.
 
-        After a full queue cut one axis off, `first` is the other: it is not cut off next.
-        Velocity and torque travel in thousandths: the torque to 0.035 N m at the joint.
+        After a full queue has cut off one axis, that axis is `first`, so it is not cut off again.
+        Velocity and torque are sent in thousandths: the torque to 0.035 N m at the joint.
         """
         second = 1 - first
         pos, vel, torque, ids = target.pos_turns, target.vel_turns, target.torque, self._input_ids
@@ -141,7 +141,7 @@ def _milli(value: float) -> int:
 
 
 def positions(nodes: Nodes, turns: Pair, dialect: Dialect, counts_per_turn: int | None) -> bytes:
-    """Return the frames that write both motors' position: turns for 0.6, counts for 0.5.
+    """Return the frames that write both motors' positions: turns for 0.6, counts for 0.5.
 
     Raises:
         DriveError: the firmware or the counts per turn are unknown, or the position is invalid.
@@ -149,14 +149,13 @@ def positions(nodes: Nodes, turns: Pair, dialect: Dialect, counts_per_turn: int 
     who = f"CAN nodes {nodes[0]} and {nodes[1]}"
     if dialect == "":
         raise DriveError(
-            f"{who}: no heartbeat has shown yet which firmware they have; "
-            "wait until the drive reports a state"
+            f"{who}: no heartbeat has shown the firmware yet; wait until the drive reports a state"
         )
     if dialect == "0.5" and counts_per_turn is None:
-        raise DriveError(f"{who}: firmware 0.5 takes counts; give the encoder's to a turn")
+        raise DriveError(f"{who}: firmware 0.5 takes counts; give the encoder's counts per turn")
     scale = counts_per_turn if dialect == "0.5" and counts_per_turn is not None else 1
     if not all(abs(turn * scale) < (1 << 31) - 1 for turn in turns):
-        raise DriveError(f"{who}: {turns[0]:g} and {turns[1]:g} turns are more than 32 bits hold")
+        raise DriveError(f"{who}: {turns[0]:g} and {turns[1]:g} turns do not fit into 32 bits")
     if dialect == "0.5":
         payloads = [cansimple.pack_i32(round(turn * scale)) for turn in turns]
     else:

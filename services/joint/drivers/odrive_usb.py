@@ -1,15 +1,14 @@
 """One ODrive v3 over USB and the `odrive` package, unmodified (docs/drives.md).
 
-Threads. The rule is that a service has one; this driver is the exception. The package
-brings its own asyncio loop in a thread (and libodrive a second one under it), and a
-transfer may take 0.5 s to fail. So every transfer runs on the package's loop, and the
-control thread only swaps: it takes the newest sample and leaves the newest target. Only
-references to frozen objects cross, each written by one side.
+Threads: a service normally has one; this driver is the exception. The package runs its own asyncio
+loop in a thread (and libodrive a second one below it), and a transfer may take 0.5 s to fail. So
+every transfer runs on the package's loop. The control thread only takes the newest sample and
+leaves the newest target. Only references to frozen objects cross, each written by one side.
 
-An exchange is a sample, and at once the control thread's target for it: with a target that was a
-period late the robot shook. There are at most 200 a second. Every four endpoints cost a round trip,
-so only what is new is written, and the states are read less often. That is for the drives' own
-loops; at 1 kHz use CAN.
+An exchange reads a sample, and at once writes the control thread's target for it: with a target one
+period late, the robot shook. There are at most 200 exchanges a second. Every four endpoints cost a
+round trip, so only changes are written, and the states are read less often. That suffices for the
+drives' own loops; use CAN for 1 kHz.
 """
 
 from __future__ import annotations
@@ -37,48 +36,48 @@ from shared.exceptions import DriveError
 from shared.extras import libusb_fix
 
 EXCHANGE_HZ: Final = 200
-"""Largest rate, Hz: a v3 board answers no faster over USB (docs/drives.md)."""
+"""Maximum rate of exchanges, Hz: a v3 board answers no faster over USB (docs/drives.md)."""
 PATIENCE: Final = 1.5
-"""Periods of the exchange for which `read` waits at least: one alone is often just missed."""
+"""Minimum wait of `read`, in exchange periods: with one period it would often miss the sample."""
 FEED_MS: Final = 1000
-"""Time after `arm` in which the watchdogs are fed without a target: the control loop waits."""
+"""Time after `arm` in which the watchdogs are fed without a target, ms: the control loop waits."""
 RETRY_S: Final = 0.2
-"""Between two attempts to connect."""
+"""Time between two attempts to connect, s."""
 STATES_EVERY: Final = 4
-"""Exchanges of a drive that we hold armed from one look at its states to the next: 20 ms."""
+"""Exchanges with an armed drive from one read of its states to the next: 20 ms."""
 COUNTS_EVERY: Final = 20
-"""Exchanges of a drive that is not armed from one look at its counts to the next: 100 ms."""
+"""Exchanges with a drive that is not armed from one read of its counts to the next: 100 ms."""
 ANSWER_S: Final = 0.003
-"""Time an exchange waits for the control thread's target after its sample."""
+"""Time for which an exchange waits for the control thread's target after its sample, s."""
 REPORT_S: Final = 5.0
-"""Time after which a drive that is not found is reported: its number may be another's."""
+"""Time after which a missing drive is reported, s: its serial number may be another drive's."""
 TURNS_MAX: Final = 1 << 13
-"""Largest position: with 18 bits a turn, the count of an axis has 31 bits and a sign."""
+"""Largest position, turns: at 18 bits per turn, an axis's count has 31 bits and a sign."""
 CLOSE_S: Final = 1.0
-"""Time that `close` waits for a last request; not for the control path."""
+"""Time for which `close` waits for a last request, s; not for the control path."""
 
 _ZERO = (0.0, 0.0)
 
 
 class _Request:
-    """Request of the control thread; its identity tells it from an earlier one."""
+    """Request of the control thread; its identity distinguishes it from an earlier one."""
 
     def __init__(self, *, arm: bool = False, clear: bool = False) -> None:
         self.arm, self.clear = arm, clear
 
 
 class _Wanted:
-    """What the control thread has left for the package's loop, the newest of each."""
+    """Newest target, request and position that the control thread left for the package's loop."""
 
     def __init__(self) -> None:
         self.target: MotorTarget | None = None
         self.request: _Request | None = None
-        self.position: Pair | None = None  # the loop takes it away when it is written
+        self.position: Pair | None = None  # the loop clears it once it is written
         self.closing = False
 
 
 class _Exchanged:
-    """How far the package's loop has come with the drive; the control thread writes none of it."""
+    """Progress of the package's loop with the drive; the control thread only reads it."""
 
     def __init__(self) -> None:
         self.request: _Request | None = None  # carried out last
@@ -87,43 +86,43 @@ class _Exchanged:
         self.status, self.errors = DriveStatus.LOST, 0
         self.count = 0  # of exchanges
         self.heat_at_ns = 0
-        self.feed_until_ns = 0  # later than 0: arm was asked for, and no idle since
+        self.feed_until_ns = 0  # above 0: arm was requested, and idle not since
 
 
 def device_manager() -> DeviceManager:
-    """Return the package's manager, on a loop in a thread of its own; loads libusb-1.0.
+    """Return the package's manager, on a loop in its own thread; loads libusb-1.0.
 
     Raises:
-        DriveError: there is no libusb-1.0 on this system.
+        DriveError: libusb-1.0 is missing on this system.
     """
     try:
         return get_device_manager(force_background_thread=True)
     except OSError as error:
-        raise DriveError(f"USB: {error}; the odrive package needs it: {libusb_fix()}") from error
+        raise DriveError(
+            f"USB: {error}; the odrive package needs libusb-1.0, from {libusb_fix()}"
+        ) from error
 
 
 class OdriveUsb:
     """Both axes of one ODrive; implements `services.joint.drivers.base.Drive`.
 
-    The drive is found by its serial number whenever it is plugged in; until then and
-    after it was pulled out the status is LOST. It is armed in position mode with the
-    gains at zero, so without a target there is no torque; `write_torque` is a target
-    with zero gains.
+    The drive is found by its serial number whenever it is plugged in; while it is unplugged, the
+    status is LOST. It is armed in position mode with zero gains, so there is no torque without a
+    target; `write_torque` sends a target with zero gains.
 
-    Watchdogs that the drive has on are fed with each new target, so a control loop that
-    hangs lets them fire.
+    Enabled watchdogs are fed with each new target, so they expire if the control loop hangs.
 
     Attributes:
-        write_failures: targets that were no numbers, or that no drive was there for.
-        connections: how often the drive was found and connected.
-        trouble: why the last connection failed, ended or did not come about; "" at first.
+        write_failures: invalid targets, and targets without a connected drive.
+        connections: number of times that the drive was connected.
+        trouble: why the last connection failed, ended or was not made; "" at first.
     """
 
     def __init__(self, serial_number: str, drive: DriveConfig) -> None:
-        """Start to look for a drive by its serial number, 12 hexadecimal digits.
+        """Start to search for a drive by its serial number, 12 hexadecimal digits.
 
         Raises:
-            DriveError: there is no libusb-1.0 on this system.
+            DriveError: libusb-1.0 is missing on this system.
         """
         self.write_failures = 0
         self.connections = 0
@@ -134,7 +133,7 @@ class OdriveUsb:
         self._torque_max = drive.current_lim * drive.torque_constant
         self._lost_after_s = drive.lost_after_s
         self._wanted = _Wanted()
-        self._silent_s = 0.0  # waited in vain: a process that was stopped has not waited
+        self._silent_s = 0.0  # waited without a sample, except in a stopped process
         # Written by the package's loop:
         self._sample = DriveReading(now_ns(), _ZERO, _ZERO, DriveStatus.LOST, 0)
         self._fresh = threading.Event()
@@ -159,7 +158,7 @@ class OdriveUsb:
             self._fresh.clear()
             self._silent_s = 0.0
             sample = self._sample
-            if self._wanted.request is not self._done.request:  # it tells of the time before
+            if self._wanted.request is not self._done.request:  # it predates the request
                 return msgspec.structs.replace(sample, status=DriveStatus.IDLE, error=0)
             return sample
         sample = self._sample
@@ -175,9 +174,8 @@ class OdriveUsb:
     def write(self, target: MotorTarget) -> None:
         """Leave a target for the next exchange; the newest wins.
 
-        The feedforward is at most `current_lim`'s worth. A target that is no number a drive can
-        take is not sent, as over CAN: the drive keeps the last one. Packing it would fail, and that
-        ends the connection.
+        The feedforward is clipped to `current_lim`. An invalid target is not sent, as over CAN, and
+        the drive keeps the last one: packing it would fail, which would end the connection.
         """
         if not self._connected or not is_target(target):
             self.write_failures += 1
@@ -195,9 +193,9 @@ class OdriveUsb:
     def arm(self, *, onboard: bool) -> None:  # noqa: ARG002 - see below
         """Request closed loop on both axes; errors are cleared and the gains zeroed first.
 
-        It is position mode for `onboard` and for torques alike: with zero gains it gives
-        the same torque, and torque mode would limit it by the present vel_gain. Like `idle` the
-        request is dropped if the drive is lost before; the caller repeats it.
+        Position mode serves `onboard` and plain torques: with zero gains it gives the same torque,
+        and torque mode would limit it by the present vel_gain. Like `idle`, the request is dropped
+        if the drive is lost first; the caller repeats it.
         """
         self._wanted.request = _Request(arm=True)
 
@@ -206,20 +204,22 @@ class OdriveUsb:
         self._wanted.request = _Request(clear=True)
 
     def idle(self) -> None:
-        """Ask both axes to go idle, with their input torque zeroed; see `arm`."""
+        """Command both axes to go idle, with their input torque zeroed; see `arm`."""
         self._wanted.request = _Request(arm=False)
 
     def set_position(self, turns: Pair) -> None:
-        """Request writing both encoders' position, turns; dropped if the drive is lost before.
+        """Request writing both encoders' positions, turns; dropped if the drive is lost first.
 
         Raises:
-            DriveError: it is lost now, or the position is more than its count can hold.
+            DriveError: the drive is lost now, or its count cannot hold the position.
         """
         if not self._connected:
-            raise DriveError(f"ODrive {self._serial_number}: lost; its position cannot be written")
+            raise DriveError(
+                f"ODrive {self._serial_number}: the drive is lost; its position cannot be written"
+            )
         if not all(abs(turn) < TURNS_MAX for turn in turns):
             raise DriveError(
-                f"ODrive {self._serial_number}: {turns[0]:g} and {turns[1]:g} turns are no "
+                f"ODrive {self._serial_number}: {turns[0]:g} and {turns[1]:g} turns are not valid "
                 f"positions; give less than {TURNS_MAX} turns"
             )
         self._wanted.position = turns
@@ -237,16 +237,16 @@ class OdriveUsb:
     # The package's side: everything below runs on its loop.
 
     async def _run(self, manager: DeviceManager) -> None:
-        """Connect, exchange, and begin again when the drive is gone; never raises."""
+        """Connect, exchange, and start over when the drive is gone; never raises."""
         while not self._wanted.closing:
             device: RuntimeDevice | None = None
             try:
                 device = await self._find(manager)
                 if device is not None:
                     board = OdriveV3(device)
-                    await board.look()
-                    # What was left for a drive that was not there is not for this one: it
-                    # may hold the robot by its own loop, and has no use for an old target.
+                    await board.read_settings()
+                    # What was left for an absent drive does not apply to this one: it may hold
+                    # the robot with its own loop, and an old target would be wrong.
                     self._done.request, self._wanted.position = self._wanted.request, None
                     self._done.target = self._wanted.target
                     self._done.status = DriveStatus.LOST
@@ -275,13 +275,13 @@ class OdriveUsb:
                 if search.done():
                     return search.result()
                 if loop.time() > report_at:
-                    self._report("not on USB; `xrl doctor` lists the serial numbers that are there")
+                    self._report("not on USB; `xrl doctor` lists the connected serial numbers")
         finally:
             search.cancel()
         return None
 
     def _report(self, trouble: str) -> None:
-        """Log why the drive is absent, unless that was the last line."""
+        """Log why the drive is absent, unless that was the last report."""
         if trouble != self.trouble:
             self.trouble = trouble
             log.get("xrl").warning("ODrive %s: %s", self._serial_number, trouble)
@@ -304,16 +304,16 @@ class OdriveUsb:
         request, position = wanted.request, wanted.position
         new = request if request is not done.request else None
         if position is not None and (new is None or new.arm):
-            # Never while armed, or it jumps by as many turns: to arm waits for the next
+            # Never while armed, or it jumps by as many turns. So arming waits for the next
             # exchange, and so does the position if it comes with a request to go idle.
             await board.set_position(position)
-            if wanted.position is position:  # and not another one by now
+            if wanted.position is position:  # and no newer one
                 wanted.position = None
             request = done.request
         elif new is not None:
             await self._carry_out(board, new)
         await self._take_sample(board)
-        done.request = request  # not before there is a sample of the time after it
+        done.request = request  # only with a sample taken after it
         await self._answer()
         target, sent = wanted.target, done.target
         done.target = target
@@ -323,7 +323,7 @@ class OdriveUsb:
             await board.feed()
 
     async def _answer(self) -> None:
-        """Wait until the control thread has written, but not for long."""
+        """Wait until the control thread has written, for at most `ANSWER_S`."""
         awaited = self._awaited
         if awaited is not None:
             timer = asyncio.get_running_loop().call_later(ANSWER_S, _resolve, awaited)
@@ -352,7 +352,7 @@ class OdriveUsb:
         if t_ns >= done.heat_at_ns:
             done.heat_at_ns = t_ns + HEAT_EVERY_NS
             fet, motor = await board.heat()
-        if all(map(isfinite, values)):  # else it is no sample
+        if all(map(isfinite, values)):  # otherwise it is not a sample
             pos, vel = (values[0], values[1]), (values[2], values[3])
             self._sample = DriveReading(
                 t_ns, pos, vel, done.status, done.errors, torque, zero, fet, motor
@@ -362,7 +362,7 @@ class OdriveUsb:
             self._fresh.set()
 
     async def _judge(self, board: OdriveV3, states: tuple[int, ...]) -> None:
-        """Make the status out of both axes' states."""
+        """Derive the status from both axes' states."""
         done = self._done
         done.errors = 0
         if any(state != AxisState.CLOSED_LOOP_CONTROL for state in states):
@@ -379,16 +379,16 @@ class OdriveUsb:
         elif request.arm:
             await board.arm(self._drive.vel_limit, self._drive.current_lim)
             done.feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
-            done.target = self._wanted.target  # it was for the time before
+            done.target = self._wanted.target  # from before arming
         else:
             await board.idle()
             done.feed_until_ns = 0
         board.target.forget()
         done.axes = AxesStatus()
-        done.status = DriveStatus.LOST  # it is looked at before it is told
+        done.status = DriveStatus.LOST  # until its states are read
 
 
 def _resolve(future: asyncio.Future[None]) -> None:
-    """End the wait for it, if it has not ended."""
+    """End the wait for a future, if it has not ended."""
     if not future.done():
         future.set_result(None)

@@ -1,4 +1,4 @@
-"""The part of an ODrive v3's tree that the USB driver uses, and what its registers say."""
+"""Part of an ODrive v3's property tree that the USB driver uses, and its registers' meaning."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _THERMISTORS = ("motor.fet_thermistor.temperature", "motor.motor_thermistor.temp
 
 
 class AxesStatus:
-    """Judges both axes, and remembers which were armed: one that left closed loop is an error."""
+    """Judges both axes; an axis that was armed and left closed loop is an error."""
 
     def __init__(self) -> None:
-        """Begin after a request to arm or idle: neither axis has been armed since."""
+        """Start after a request to arm or idle: neither axis has been armed since."""
         self._was_armed = [False, False]
 
     def judge(self, states: Sequence[int], errors: int) -> DriveStatus:
-        """Return the status by `current_state` of both axes and `errors`.
+        """Return the status from `current_state` of both axes and `errors`.
 
         An axis that left closed loop is an error even without an error bit: OVERSPEED
         leaves `axis.error` at 0.
@@ -55,7 +55,7 @@ class AxesStatus:
     def errors(registers: Sequence[int], *, wanted_armed: bool) -> int:
         """Return `AxisError` bits of (axis, motor, encoder, controller) of axis0, then axis1.
 
-        A watchdog that ran out in IDLE only shows that nothing was written yet, and is no error.
+        An expired watchdog in IDLE only shows that nothing was written yet, and is not an error.
         """
         errors = 0
         for i in (0, 4):
@@ -79,17 +79,17 @@ class _EndpointBatch:
         self._codec = struct.Struct("<" + "".join(each.codec.struct_format for each in properties))
 
     async def read(self) -> tuple[Any, ...]:
-        """Return the values of all."""
+        """Read all values."""
         buffer = await self._device.read_endpoints(self._ids, self._sizes, transient=False)
         return self._codec.unpack(buffer)
 
     async def write(self, values: Sequence[float]) -> None:
-        """Write a value to each."""
+        """Write one value to each endpoint."""
         await self._device.write_endpoints(self._ids, self._sizes, self._codec.pack(*values))
 
 
 class TargetWriter:
-    """Writes the target of both motors' own loops, as far as it is new to the drive.
+    """Writes the values of both motors' target that are new to the drive.
 
     Args:
         device: the package's `RuntimeDevice`.
@@ -104,7 +104,7 @@ class TargetWriter:
         self._batches: dict[tuple[int, ...], _EndpointBatch] = {}
 
     def forget(self) -> None:
-        """Write everything the next time: the drive's present values are not known."""
+        """Write everything next time: the drive's present values are unknown."""
         self._written = None
 
     async def write(self, target: MotorTarget) -> None:
@@ -122,7 +122,7 @@ class TargetWriter:
         if batch is None:
             properties = [self._properties[index] for index in new]
             batch = self._batches[new] = _EndpointBatch(self._device, properties)
-        self._written = None  # if it fails, nobody knows what came through
+        self._written = None  # if it fails, the drive's values are unknown
         await batch.write([values[index] for index in new])
         for index in new:
             written[index] = values[index]
@@ -132,10 +132,10 @@ class TargetWriter:
 def values_of(target: MotorTarget) -> tuple[float, ...]:
     """Return a target's values in the order of `TargetWriter`.
 
-    `input_vel` stays at zero, because four inputs are one round trip and six are two. The velocity
-    goes with the position, `pos + vel / pos_gain`: for the firmware's law, its clamp included, the
-    same target; without a pos_gain it goes with the torque. So the torque is the same, also
-    when writing stops.
+    `input_vel` stays at zero, because four inputs take one round trip and six take two. The
+    velocity is sent in the position, `pos + vel / pos_gain`: the same target for the firmware's
+    law, its clamp included. Without a pos_gain it is sent in the torque. So the torque is the same,
+    also when writing stops.
     """
     pos_0, torque_0 = _inputs_of(target, 0)
     pos_1, torque_1 = _inputs_of(target, 1)
@@ -158,12 +158,12 @@ class OdriveV3:
 
     Attributes:
         sample: position of both axes, then velocity.
-        sample_and_state: the same, then the state of both axes.
+        sample_and_state: `sample`, then the state of both axes.
         errors: the four error registers of axis0, then of axis1.
         target: the inputs and gains of both axes.
 
     Raises:
-        DriveError: it is another drive or firmware than this driver knows.
+        DriveError: the driver does not know this drive or firmware.
     """
 
     def __init__(self, device: Any) -> None:
@@ -198,7 +198,7 @@ class OdriveV3:
         if all(f"{axis}.{name}" in device.properties for axis in _AXES for name in _THERMISTORS):
             self._heat = _EndpointBatch(device, self._both(_THERMISTORS))
 
-    async def look(self) -> None:
+    async def read_settings(self) -> None:
         """Read saved settings: watchdogs, and the direction of the currents."""
         enabled = await self._watchdogs.read()
         self._food = [
@@ -211,10 +211,10 @@ class OdriveV3:
             self._signs = (-1 if first < 0 else 1, -1 if second < 0 else 1)
 
     async def torques(self, torque_constant: float) -> Pair | None:
-        """Return what both axes' own loops ask for, N m; None if that is no number.
+        """Return the torques that both axes' own loops request, N m; None unless both are finite.
 
-        A current counts in the direction that the encoder's calibration has found, by how the
-        phases are wired: the firmware turns the torque round where it is -1.
+        A current's sign follows the direction that the encoder's calibration found, which depends
+        on the phase wiring: the firmware inverts the torque where the direction is -1.
         """
         first, second = await self._currents.read()
         if not (isfinite(first) and isfinite(second)):
@@ -223,13 +223,13 @@ class OdriveV3:
         return sign_0 * first * torque_constant, sign_1 * second * torque_constant
 
     async def encoder_zero(self) -> Pair:
-        """Return where both encoders' angles within the turn are 0, turns modulo one."""
+        """Return where both encoders' angles within the turn are 0, in turns modulo one."""
         count, in_turn, per_turn, count_1, in_turn_1, per_turn_1 = await self._counts.read()
         zero_1 = (count_1 - in_turn_1) % per_turn_1 / per_turn_1
         return (count - in_turn) % per_turn / per_turn, zero_1
 
     async def heat(self) -> tuple[Pair | None, Pair | None]:
-        """Return what the thermistors of output stages and motors read, C; None: nothing."""
+        """Return thermistor readings of output stages and motors, C; None without thermistors."""
         if self._heat is None:
             return None, None
         fet_0, motor_0, fet_1, motor_1 = await self._heat.read()
@@ -237,11 +237,11 @@ class OdriveV3:
 
     @property
     def hungry(self) -> bool:
-        """True if a watchdog runs: over USB nothing but `feed` feeds it."""
+        """True if a watchdog is enabled: over USB, only `feed` feeds it."""
         return bool(self._food)
 
     async def feed(self) -> None:
-        """Feed the watchdogs that run."""
+        """Feed the enabled watchdogs."""
         for food in self._food:
             await self.device.call_function(food)
 
@@ -257,7 +257,7 @@ class OdriveV3:
         await self.device.call_function("clear_errors")
 
     async def arm(self, vel_limit: float, current_lim: float) -> None:
-        """Ask both axes for closed loop, without torque and gains; turn/s and A."""
+        """Command closed loop on both axes, without torque and gains; limits in turn/s and A."""
         await self.clear_errors()
         modes = (ControlMode.POSITION, InputMode.PASSTHROUGH)
         await self._write_both(ARM_SETTINGS, (*modes, vel_limit, current_lim, *[0.0] * 5))
@@ -265,7 +265,7 @@ class OdriveV3:
         await self._write_both(("requested_state",), (AxisState.CLOSED_LOOP_CONTROL,))
 
     async def idle(self) -> None:
-        """Ask both axes to go idle, with their input torque zeroed."""
+        """Command both axes to go idle, with their input torque zeroed."""
         await self._write_both(IDLE_SETTINGS, (0.0, AxisState.IDLE))
 
     async def _write_both(self, names: tuple[str, ...], values: tuple[float, ...]) -> None:
@@ -279,7 +279,7 @@ class OdriveV3:
         missing = [path for path in paths if path not in properties]
         if missing:
             raise DriveError(
-                f"ODrive {self.device.serial_number}, firmware {self.device.fw_version}: it has no "
+                f"ODrive {self.device.serial_number}, firmware {self.device.fw_version}: it lacks "
                 f"{missing[0]}; this driver is for an ODrive v3 with firmware 0.5.x"
             )
         return [properties[path] for path in paths]

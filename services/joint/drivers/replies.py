@@ -1,6 +1,6 @@
-"""What an ODrive's two axes answer when they are asked over CANSimple: counts and currents. Pure.
+"""Replies of an ODrive's two axes over CANSimple, such as counts and currents. Pure.
 
-Counts stand in for estimates of firmware 0.5.6: it sends what its controller sees of the encoder,
+Counts replace the estimates of firmware 0.5.6. It sends what its controller sees of the encoder:
 exactly 0, 0 from each start-up until the first closed loop, wherever the motor is.
 """
 
@@ -23,29 +23,29 @@ _BYTES: Final = 8
 
 
 class Replies:
-    """Both axes' newest answers; axis0, then axis1.
+    """Newest replies of both axes; axis0, then axis1.
 
     Attributes:
         ask_version: requests for the firmware's version.
         ask_currents: requests for the currents.
         ask_count: request for the encoder's count, for each axis.
-        ask_heat: requests for the temperatures, which firmware 0.6 knows.
+        ask_heat: requests for the temperatures, which firmware 0.6 reports.
         ask_supply: request for the voltage of the supply.
-        supply_v: the newest, V; 0: not known.
-        has_news: an answer has come that `encoder_zero` or `heat` may return.
-        counted: position in turns, without velocity, of an axis that sends no estimates; None: no
-            answer, or estimates have arrived.
+        supply_v: the newest supply voltage, V; 0 if unknown.
+        has_news: True after a reply that `encoder_zero` or `heat` may return.
+        counted: position in turns, without velocity, of an axis that sends no estimates; None
+            without a reply, or after estimates have arrived.
     """
 
     def __init__(
         self, node_ids: tuple[int, int], torque_constant: float, counts_per_turn: int | None
     ) -> None:
-        """Begin without answers.
+        """Start without replies.
 
         Args:
             node_ids: CAN nodes of axis0 and axis1.
             torque_constant: N m/A.
-            counts_per_turn: counts of an encoder per turn; None: counts are ignored.
+            counts_per_turn: counts of an encoder per turn; None to ignore counts.
         """
 
         def requests(command: int) -> bytes:
@@ -67,12 +67,12 @@ class Replies:
 
     @property
     def torques(self) -> Pair | None:
-        """Torque of both motors' own loops, N m; None: unknown."""
+        """Torque of both motors' own loops, N m; None if unknown."""
         a, b = self._torques
         return (a, b) if a is not None and b is not None else None
 
     def heat(self) -> tuple[Pair | None, Pair | None]:
-        """Return what the thermistors of output stages and motors read, C, once both axes told."""
+        """Return the thermistor readings of output stages and motors, C, once both axes replied."""
         first, second = self._heat
         if first is None or second is None:
             return None, None
@@ -80,17 +80,17 @@ class Replies:
         return real_readings(first[0], second[0]), real_readings(first[1], second[1])
 
     def take_heat(self, axis: int, data: bytes) -> None:
-        """Take the temperatures of axis 0 or 1: output stage, motor."""
+        """Store the temperatures of axis 0 or 1: output stage, motor."""
         if len(data) == _BYTES:
             self._heat[axis] = cansimple.unpack_two_floats(data)
             self.has_news = True
 
     def forget_counts(self) -> None:
-        """Forget the counts: the drive may have restarted, or be another one."""
+        """Forget the counts: the drive may have restarted, or may be another one."""
         self.counted[:] = self._zeros[:] = None, None
 
     def encoder_zero(self) -> Pair | None:
-        """Return `DriveReading.encoder_zero`, once for each time that both axes answered."""
+        """Return `DriveReading.encoder_zero`, once each time both axes have replied."""
         a, b = self._zeros
         if a is None or b is None:
             return None
@@ -98,11 +98,11 @@ class Replies:
         return (a, b)
 
     def forget_torques(self) -> None:
-        """Forget the currents: they were of the time before."""
+        """Forget the currents: they predate the last command."""
         self._torques[:] = None, None
 
     def take_count(self, axis: int, data: bytes) -> None:
-        """Take the count of axis 0 or 1; it shows no velocity."""
+        """Store the count of axis 0 or 1; it shows no velocity."""
         if len(data) == _BYTES and self._counts_per_turn is not None:
             shadow_count, in_turn = cansimple.unpack_two_ints(data)
             self.counted[axis] = (shadow_count / self._counts_per_turn, 0.0)
@@ -111,17 +111,17 @@ class Replies:
             self.has_news = True
 
     def take_supply(self, _axis: int, data: bytes) -> None:
-        """Take the supply's voltage; both axes have one."""
+        """Store the voltage of the supply, which both axes share."""
         if len(data) == _BYTES:
             volts, _ = cansimple.unpack_two_floats(data)
             if isfinite(volts):
                 self.supply_v = max(0.0, volts)
 
     def take_current(self, axis: int, data: bytes) -> None:
-        """Take the current setpoint of axis 0 or 1; one that is not finite is no answer.
+        """Store the current setpoint of axis 0 or 1, unless it is not finite.
 
-        Its sign is the torque's where `encoder.config.direction` is 1: CAN of firmware 0.5 cannot
-        read that; `xrl doctor` reads it over USB.
+        Its sign is the torque's only where `encoder.config.direction` is 1. Firmware 0.5 does not
+        report that over CAN; `xrl doctor` reads it over USB.
         """
         if len(data) == _BYTES:
             current, _ = cansimple.unpack_two_floats(data)

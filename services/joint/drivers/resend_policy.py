@@ -1,7 +1,7 @@
-"""When gains, limits and modes go to an ODrive on CAN along with a target. Pure.
+"""Decides when gains, limits and modes are sent to an ODrive on CAN with a target. Pure.
 
 Nothing shows whether a drive has received them, and a frame may be lost. A stiffness that should be
-off but is on adds to the torques computed without it (25 N m for 100 ms in a study); a limit of 2
+off but is on adds to the torques computed without it (25 N m for 100 ms in a study). A limit of 2
 turn/s or torque mode would be felt too.
 """
 
@@ -14,14 +14,14 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
 
 GAINS_MS: Final = 100
-"""Gains go to the drive when they change, and this often."""
+"""Gains are sent when they change, and with this period, ms."""
 DRIFT_MS: Final = 10
-"""Gains that change are sent once more with the next target. Gains that changed within this time
-before are sent again only after this time: they drift, a lost frame is soon replaced, and the bus
-has other work."""
+"""Gains that change are sent again with the next target. If they also changed within this time
+before, ms, they are sent again only after this time: drifting gains soon replace a lost frame, and
+the bus has other traffic."""
 SETTLE_MS: Final = 1000
-"""Time after `arm` in which limits and modes are sent every `GAINS_MS`. A drive that is taken over
-gets none: firmware 0.5 disarms when a current limit falls below the present current."""
+"""Time after `arm` in which limits and modes are sent every `GAINS_MS`, ms. A drive that is taken
+over gets none: firmware 0.5 disarms when a current limit falls below the present current."""
 
 Gains = tuple[Pair, Pair]
 """Position gains 1/s and velocity gains N m s/turn, of both axes."""
@@ -30,7 +30,7 @@ _NONE: Final[Gains] = ((0.0, 0.0), (0.0, 0.0))
 
 
 class GainRow(IntEnum):
-    """What goes out with a target."""
+    """Frames that are sent with a target."""
 
     INPUTS = 0
     GAINS = 1
@@ -40,10 +40,10 @@ class GainRow(IntEnum):
 
 
 class ResendPolicy:
-    """Keeps what was sent to the drive, and when.
+    """Tracks what was sent to the drive, and when.
 
     Attributes:
-        gains: sent last; None: none since the bus was opened.
+        gains: last gains sent; None if none were sent since the bus was opened.
     """
 
     def __init__(self) -> None:
@@ -58,13 +58,13 @@ class ResendPolicy:
         self.gains = None
 
     def armed(self, now_ns: int) -> None:
-        """Begin with a drive that was asked to arm, without gains."""
+        """Start with a drive that was commanded to arm, without gains."""
         self.gains = _NONE
         self._gains_at_ns = self._settle_at_ns = 0
         self._settle_until_ns = now_ns + SETTLE_MS * NS_PER_MS
 
     def idle(self) -> None:
-        """Stop telling limits and modes."""
+        """Stop sending limits and modes."""
         self._settle_until_ns = 0
 
     def with_target(self, gains: Gains, now_ns: int) -> GainRow:
@@ -88,7 +88,7 @@ class ResendPolicy:
         return due
 
     def cut_off(self, row: GainRow) -> None:
-        """Undo the last sending: the bus did not take all of it."""
+        """Mark the last frames as unsent: the bus did not accept all of them."""
         if row >= GainRow.GAINS:
             self._gains_at_ns = 0
         if row is GainRow.ALL:

@@ -1,10 +1,10 @@
 """A module's drive as the joint sees it: zero, motor signs, and read-only access.
 
-The encoders sit on the motors and count turns; a power cycle loses what a count means at the
-joint. So `xrl drive zero` writes the joint's position plus `mark_turns` to the drive: a motor at
-q = 0 reads `mark_turns`. After a power cycle the drive reads near 0 instead, so a lost zero is
-detected within one cycle: the drive is `UNZEROED`, it is never armed, and a drive that was armed
-faults. A failed encoder goes on reporting its last position; the drive's error shows that one.
+The encoders are on the motors and count turns; a power cycle loses what a count means at the joint.
+So `xrl drive zero` writes the joint's position plus `mark_turns` to the drive: a motor at q = 0
+reads `mark_turns`. After a power cycle the drive reads near 0 instead, so a lost zero is detected
+within one cycle: the drive is `UNZEROED` and never armed, and an armed drive faults. A failed
+encoder keeps reporting its last position; the drive's error shows the failure.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from services.joint.drivers.base import Drive, DriveReading, MotorTarget
 from shared.bus.messages import LOST_DRIVE, DriveStatus, Pair
 
 Signs = tuple[int, int]
-"""Signs of axis0 and axis1; -1: the motor counts down where the differential counts up."""
+"""Signs of axis0 and axis1; -1 if the motor counts down where the differential counts up."""
 
 
 class MotorFrame(NamedTuple):
     """Conversion between the drive's counts and motor turns from the joint's zero."""
 
     mark_turns: float = 0.0
-    """Reading of a motor at q = 0; 0: any drive counts as zeroed."""
+    """Reading of a motor at q = 0; with 0, any drive counts as zeroed."""
     signs: Signs = (1, 1)
 
     def from_drive(self, reading: DriveReading) -> DriveReading:
         """Return a reading in turns from the joint's zero; UNZEROED if the position is invalid.
 
-        A driver may return NumPy scalars: `float` ends them here, for they are slow, compute in
-        single precision if they are of it, and no message may hold one.
+        A driver may return NumPy scalars. `float` converts them here: they are slow, may compute in
+        single precision, and no message may hold one.
         """
         mark, (sign_a, sign_b) = self
         (a, b), (vel_a, vel_b), torque = reading.pos_turns, reading.vel_turns, reading.torque
@@ -74,7 +74,7 @@ class MotorFrame(NamedTuple):
         return ((turns[0] + mark) * sign_a, (turns[1] + mark) * sign_b)
 
     def torque(self, torque: Pair) -> Pair:
-        """Return motor torques, N m, as the drive counts them, and the other way round."""
+        """Convert motor torques, N m, to or from the signs of the drive."""
         return (torque[0] * self.signs[0], torque[1] * self.signs[1])
 
 
@@ -85,9 +85,9 @@ def _floats(pair: Pair | None) -> Pair | None:
 class WiredDrive:
     """A drive behind its motor frame; implements `Drive`.
 
-    Read-only, for bring-up and beside another controller, it sends nothing to the drive. An armed
-    drive then belongs to somebody else and reads as IDLE, so the service stays DISARMED: it
-    publishes the joint's position and the drive's errors, and takes no command.
+    With `read_only`, for bring-up and beside another controller, it sends nothing to the drive. An
+    armed drive then belongs to another controller and reads as IDLE. So the service stays DISARMED:
+    it publishes the joint's position and the drive's errors, and accepts no command.
     """
 
     def __init__(self, drive: Drive, frame: MotorFrame, *, read_only: bool = False) -> None:

@@ -1,1 +1,1 @@
-"""The whole-body law: from measured joints to references, gains and torques. Pure."""
+"""Whole-body law: from measured joints to references, gains and torques. Pure."""

@@ -1,7 +1,7 @@
-"""Controls forces at the harness: assist, easing of the lead, overload (docs/law.md#harness).
+"""Forces at the harness: assist, easing of the lead, overload (docs/law.md#harness). Pure.
 
-The wrench is what the operator applies to the torso at the harness point, in torso axes. The
-robot's upward force on the operator is minus its part along the world's z. Pure: inputs -> outputs.
+The operator applies the wrench to the torso at the harness point; it is given in torso axes. The
+robot's upward force on the operator is minus the wrench's force along world z.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import AssistConfig, HarnessConfig
 
 ERROR_MIN: Final = 5.0
-"""N; force that dry friction in the joints hides (0.3 N m a joint: 5 to 6 N at the harness). Within
-it the force does not follow the assist, and an integral would hunt."""
+"""N; force that dry friction in the joints hides (0.3 N m per joint: 5 to 6 N at the harness).
+Within this band the force does not follow the assist, so an integral would hunt."""
 SETTLE_S: Final = 0.3
-"""s; wait of the integral after the request or the pose has moved."""
+"""s; delay of the integral after the request or the pose has changed."""
 STILL_RATE_Z: Final = 0.02
 """m/s of the COM; above it the operator is leading."""
 STILL_RATE_PITCH: Final = 0.05
 """rad/s of the torso; above it the operator is leading."""
 LEAD_MAX: Final = (150.0, 60.0)
-"""N and N m; a leading hand does no more, and larger values are not amplified."""
+"""N and N m; largest lead that is amplified. A leading hand does not exceed it."""
 LEAD_FADE_S: Final = 0.1
 """s; the easing fades out over this time when the wrench is lost."""
 RELEASE_FRACTION: Final = 0.8
-"""Fraction of an overload's limits; below it the harness counts as released."""
+"""Fraction of the overload limits, below which the harness counts as released."""
 
 
 def force_up(force: Vector3, roll: float, pitch: float) -> float:
-    """Return the part of a force along the world's z, N.
+    """Return a force's component along world z, N: the third row of R = Rz(yaw) Rx(roll) Ry(pitch).
 
     Args:
         force: N, torso axes.
-        roll: of the torso, rad; R = Rz(yaw) Rx(roll) Ry(pitch), whose third row this is.
-        pitch: rad.
+        roll: torso roll, rad.
+        pitch: torso pitch, rad.
     """
     x, y, z = force
     return math.sin(roll) * y + math.cos(roll) * (z * math.cos(pitch) - x * math.sin(pitch))
@@ -50,12 +50,12 @@ def force_up(force: Vector3, roll: float, pitch: float) -> float:
 def wrench_in_world(wrench: Wrench, roll: float, pitch: float) -> tuple[Array, float]:
     """Return the operator's force (3,), N, and moment about pitch, N m, in world axes without yaw.
 
-    The force to the side is left out (0): nothing here asks for it.
+    The lateral force is set to 0, because no caller needs it.
 
     Args:
-        wrench: of the operator on the torso.
-        roll: of the torso, rad.
-        pitch: rad; the moment is about its axis.
+        wrench: operator's wrench on the torso.
+        roll: torso roll, rad.
+        pitch: torso pitch, rad; the moment is about its axis.
     """
     x, _, z = wrench.force
     ahead = math.cos(pitch) * x + math.sin(pitch) * z
@@ -90,14 +90,14 @@ class AssistLaw:
 
         d integral / dt = e / integral_s,  |integral| <= integral_max
 
-    with e = wanted - measured beyond `ERROR_MIN`. The ramp goes up to `force_max` (N), by at most
+    with e = wanted - measured beyond `ERROR_MIN`. The ramp is limited to `force_max` (N) and
     `rate_max` (N/s); an `integral_max` of 0 disables the integral.
 
     The integral is frozen without a reading (stale, invalid or saturated), in HOLD, while the
-    request changes, and while the operator leads. The force of a leading hand is no error of the
-    assist. An integral over it would outlast the lead and pull at the operator after the turn. With
-    no request the integral decays to zero with the same time constant. It never takes the assist
-    below zero: the robot does not pull the operator down.
+    request changes, and while the operator leads. The force of a leading hand is not an assist
+    error: its integral would outlast the lead and pull at the operator after the turn. Without a
+    request, the integral decays to zero with the same time constant. It never makes the assist
+    negative: the robot does not pull the operator down.
 
     Stable in the loop with a hand of stiffness k and damping b, without delay, if integral_s is
     above m / b - b / k for a robot of mass m (docs/law.md#harness).
@@ -121,16 +121,16 @@ class AssistLaw:
         """Advance by one tick; return the rate of the assist in N/s.
 
         Args:
-            s: state of the assist, which changes.
+            s: state of the assist; updated in place.
             wanted: requested upward force on the operator, N.
-            measured: the same force measured at the harness, N; None if not known now.
+            measured: the same force measured at the harness, N; None if unknown.
             dt: time since the last tick, s.
             still: False while the robot holds or the operator leads.
-            shed_rate: N/s with which it may fall, if that is more than `rate_max`.
+            shed_rate: maximum rate at which the assist falls, N/s, if above `rate_max`.
         """
         wanted = clamp(wanted, 0.0, self._force_max)
         if s.ramp is None:
-            # a planner that takes over from HOLD finds the assist in HOLD's feedforward
+            # when the planner takes over, HOLD's feedforward already carries the assist
             s.ramp = wanted
         before = s.ramp + s.integral
         fall_max = max(self._rate_max, shed_rate) * dt
@@ -155,20 +155,20 @@ class EasingState(msgspec.Struct):
     lead: Pair = (0.0, 0.0)
     """N and N m, within `LEAD_MAX`."""
     left: float = 0.0
-    """Share of it that is used, 0 .. 1: it fades without a reading."""
+    """Fraction of the lead in use, 0 .. 1; it fades without a reading."""
 
 
 class LeadEasing:
     """Amplifies the operator's lead: F_O += alpha S w_h (docs/law.md#harness).
 
-    w_h is the operator's wrench in the directions he leads. It is his upward force beyond the load
-    that the assist carries, f + assist, and his moment about the torso's pitch axis. With alpha the
-    robot's apparent mass falls from M to M / (1 + alpha). As with F_assist, the force acts through
-    the Jacobian of the harness point, not of the COM. It belongs in tau_coupled, which HOLD drops;
-    in tau_ff it would outlive the hand.
+    w_h is the operator's wrench in the led directions: the upward force beyond the load that the
+    assist carries, f + assist, and the moment about the torso's pitch axis. Easing lowers the
+    robot's apparent mass from M to M / (1 + alpha). Like F_assist, its force acts through the
+    Jacobian of the harness point, not of the COM. It belongs in tau_coupled, which HOLD drops; in
+    tau_ff it would outlast the hand.
 
-    Stable if alpha |G(j w)| < 1 wherever the phase of G, the hand's force by the robot's, is -180
-    degrees: up to an alpha above 5 for the simulated hand (docs/law.md#harness).
+    G is the hand's force over the robot's. The loop is stable if alpha |G(j w)| < 1 wherever G's
+    phase is -180 degrees: up to an alpha above 5 for the simulated hand (docs/law.md#harness).
     """
 
     def __init__(self, alpha: float) -> None:
@@ -181,9 +181,9 @@ class LeadEasing:
         """Return alpha w_h: N along the world's z at the harness, N m about the pitch axis.
 
         Args:
-            s: state of the easing, which changes.
-            up: upward force of the operator, N, world; None if not known now: the easing fades.
-            moment_pitch: of the operator about the torso's y, N m.
+            s: state of the easing; updated in place.
+            up: operator's upward force, N, world; None if unknown, which fades the easing out.
+            moment_pitch: operator's moment about the torso's y, N m.
             assist: assist force in the feedforward, N.
             dt: time since the last tick, s.
         """
@@ -210,12 +210,12 @@ class OverloadState(msgspec.Struct):
 
 
 class Overload:
-    """Detects an overload of the harness, during which all six modules must hold.
+    """Detector of harness overloads, during which all six modules must hold.
 
-    It begins when the force or the moment has been beyond its limit for `after_ns`, or at once if a
+    An overload starts when force or moment has exceeded its limit for `after_ns`, or at once if a
     cell saturates. It ends when both have been below `RELEASE_FRACTION` of their limits for
-    `release_ns`. An invalid reading neither begins it nor interrupts a beginning: among 600 N it
-    would otherwise be held off for ever by one in ten. It does interrupt an ending.
+    `release_ns`. An invalid reading restarts only the second of these timers. If it restarted the
+    first, one invalid reading in ten would hide an overload of 600 N forever.
     """
 
     def __init__(self, config: HarnessConfig) -> None:

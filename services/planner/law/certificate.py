@@ -6,9 +6,9 @@ joint rates per unit of p along the closed chain: [J; C] T = [I; 0]. The stiffne
     K_fail = sym(T^T D T) + K_geo,    K_geo = T^T H T,
     H = d(J^T F_O + J_harness^T F_assist)/dq,
 
-K_geo is minus d/dp of T^T (tau_ff held - gravity and load). The robot stands only if K_fail > 0. A
-margin is the smallest eigenvalue of K_fail, with every direction scaled by the required stiffness
-(`certificate.K_required`). 1 meets the requirement, 0 is a fall.
+K_geo is -d/dp of T^T (tau_ff - torque of gravity and load), with tau_ff held. The robot stands only
+if K_fail > 0. A margin is the smallest eigenvalue of K_fail, with every direction scaled by the
+required stiffness (`certificate.K_required`). 1 meets the requirement, 0 is a fall.
 
 Tier 3: with its joint service dead too, each motor of a module holds with the mean of the two
 joints' stiffnesses (docs/drives.md). D is therefore averaged per module.
@@ -52,8 +52,8 @@ class Weakest(NamedTuple):
     required: float
     unit: str
     p: Array
-    """Direction (6,), m and rad; scaled by the root of the required stiffness, its largest part is
-    1."""
+    """Direction (6,), m and rad. Times the square root of the required stiffness, its largest
+    element is 1."""
 
 
 def motor_mean(D: Array) -> Array:
@@ -66,8 +66,8 @@ def motor_mean(D: Array) -> Array:
 def stiffness_graph() -> ca.Function:
     """Return the graph (T, H, D, scale) -> K_fail scaled (6, 12), K_fail (6, 6): docs/law.md (19).
 
-    Columns 0 to 5 of the first are tier 2, where D holds, and 6 to 11 tier 3, where its mean by
-    module holds. The second is that of tier 2 in N/m, N/rad and N m/rad.
+    Columns 0 to 5 of the first are tier 2, which holds with D. Columns 6 to 11 are tier 3, which
+    holds with each module's mean. The second is tier 2 in N/m, N/rad and N m/rad.
     """
     T, H = ca.MX.sym("T", N_JOINTS, 6), ca.MX.sym("H", N_JOINTS, N_JOINTS)
     D, scale = ca.MX.sym("D", N_JOINTS), ca.MX.sym("scale", 6)
@@ -84,7 +84,7 @@ def stiffness_graph() -> ca.Function:
 
 
 _graph = functools.cache(stiffness_graph)
-"""Made once; under a decorator the graph itself would have no mutants."""
+"""The graph, built once. A decorator on `stiffness_graph` would hide it from mutation tests."""
 
 
 class Certificate:
@@ -110,7 +110,7 @@ class Certificate:
     def margins(self, D: Array) -> Margins:
         """Return the margins of local stiffnesses D (12,), N m/rad.
 
-        Zero at angles at which the closed chain has no finite rates: nothing is certified there.
+        Zero where the closed chain has no finite rates: no gains are certified there.
         """
         self._evaluate(D)
         K = self._K_scaled

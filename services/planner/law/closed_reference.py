@@ -1,18 +1,18 @@
 """References of the directions that no hand leads: shift, height and pitch. Pure.
 
-**Shift.** By itself the robot keeps its COM over the ankles and its torso upright. The operator may
-request a small offset (`operator/intent`): COM forwards or sideways, torso rolled or yawed. A
-second-order follower with limits follows it without a jump. It takes at least `SHIFT_S` for the
-whole range and stays within `law.shift_max`:
+**Shift.** By default the robot keeps its COM over the ankles and its torso upright. The operator
+may request a small offset (`operator/intent`): COM forward or sideways, torso rolled or yawed. A
+second-order follower with limits tracks the request without a jump. It takes at least `SHIFT_S`
+from the middle to a limit and stays within `law.shift_max`:
 
     r'' = w^2 (wanted - r) - 2 w r',   |r'| <= shift_max / SHIFT_S
 
-**Height and pitch.** Height and torso pitch are open: a hand leads them. To go down (`xrl down`, a
-low battery) or up (`services.planner.watch.reserves`) the law closes both. The height's reference h
-moves at a bounded rate until a knee is at the end of its range; the pitch's stays where it was.
-When nobody leads (`services.planner.watch.unattended`), one of them or both are closed where they
-are. The reference begins at the measured pose, and h at its rate, so nothing steps. z is the
-measured height.
+**Height and pitch.** Height and torso pitch are open: a hand leads them. The law closes both to
+lower the robot (`xrl down`, a low battery) or to raise it (`services.planner.watch.reserves`). The
+height reference h then moves at a bounded rate until a knee is at the end of its range; the pitch
+reference stays constant. When nobody leads (`services.planner.watch.unattended`), the law closes
+one or both where they are. The references start at the measured pose, and h at the measured rate,
+so nothing steps. z is the measured height.
 
     p_ref    = (1 - hold) p_ref    + hold (h, pitch)             hold: of the height, of the pitch
     pdot_ref = (1 - hold) pdot_ref + hold (h', 0)
@@ -21,10 +21,10 @@ measured height.
     F_lift'  = FORCE_RATE (h - z) / lead,   0 <= F_lift <= FORCE_MAX, upwards only
     M'       = MOMENT_GAIN (pitch_ref - pitch), |M| <= MOMENT_MAX, while nobody leads the pitch
 
-The local gains are soft along pitch (30 N m/rad are required): M holds a torso that the robot file
-describes wrongly. It starts from the moment that the torso's acceleration shows. The force makes
-up for a hand that presses on a robot that is to rise. It acts at the COM: at the harness, ahead of
-the pitch axis, it would turn a torso that nobody holds.
+The local gains are soft along pitch (30 N m/rad are required), so M holds a torso that the robot
+file describes wrongly. M starts from the moment that the torso's acceleration shows. F_lift
+overcomes a hand that presses on a rising robot. It acts at the COM: at the harness, ahead of the
+pitch axis, it would turn a torso that nobody holds.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ShiftState(msgspec.Struct):
     at: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
     rate: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
 
-    def rest(self) -> None:
+    def stop(self) -> None:
         """Stop at the current shift while the planner is not engaged."""
         self.rate = [0.0] * len(ROWS)
 
@@ -75,10 +75,10 @@ class ShiftReference:
         self._shift_max = tuple(shift_max)
 
     def advance(self, s: ShiftState, wanted: Vector4, dt: float) -> None:
-        """Follow for dt seconds.
+        """Follow the request for dt seconds.
 
         Args:
-            s: the shift, which changes.
+            s: the shift; updated in place.
             wanted: x, y in m, roll, yaw in rad; clipped to the limits.
             dt: time since the last tick, s.
         """
@@ -91,14 +91,14 @@ class ShiftReference:
 
 
 class Toward(IntEnum):
-    """Where the robot goes by itself."""
+    """Direction in which the robot moves on its own."""
 
     DOWN = -1
     REST = 0
-    """It stays where it is."""
+    """Stay at the current height and pitch."""
     UP = 1
     PERSON = 2
-    """Nowhere: height and pitch are the person's."""
+    """No motion of its own: the person leads height and pitch."""
 
 
 RATE_MAX: Final = 0.05
@@ -106,35 +106,35 @@ RATE_MAX: Final = 0.05
 ACCELERATION: Final = 0.1
 """m/s^2"""
 STOPPING: Final = 1.0
-"""m/s^2 with which a height that nobody leads stops: from 0.16 m/s within 13 mm."""
+"""m/s^2; deceleration of a height that nobody leads: from 0.16 m/s within 13 mm."""
 APPROACH: Final = 0.2
-"""m/s per rad of the knee: the last centimetres take seconds."""
+"""m/s per rad from the end of the knee's range: the last centimetres take seconds."""
 HOLD_S: Final = 0.5
-"""Time in which the hold of height and pitch fades in, and out, s."""
+"""Fade time of the hold of height and pitch, in and out, s."""
 RELEASED_S: Final = 0.1
-"""The same for a direction that nobody leads, s: a torso gains up to 0.35 rad/s in this time."""
+"""Fade time for a direction that nobody leads, s; a torso gains up to 0.35 rad/s meanwhile."""
 LEAD_MAX: Final = 0.012
-"""m; over the local springs that is 65 N of a hand, beyond the load that is estimated."""
+"""m; across the local springs this equals 65 N of a hand, beyond the estimated load."""
 LEAD_ANGLE: Final = 0.08
-"""rad by which the reference of a joint leads it: half of what trips, and of what a joint service
-accepts (`trips.tracking`, `envelope.q_ref_distance`)."""
+"""rad; maximum lead of a joint's reference. Half of the limit that trips, and of the one in a joint
+service (`trips.tracking`, `envelope.q_ref_distance`)."""
 LEAD_PITCH: Final = 0.12
 """rad"""
 FORCE_RATE: Final = 60.0
-"""N/s where the reference leads by all that it may."""
+"""N/s at the maximum lead."""
 FORCE_MAX: Final = 200.0
-"""N, beyond the assist: a leading hand presses with 150 N at the most, and with a full assist it is
-no overload of the harness (500 N)."""
+"""N beyond the assist; a leading hand presses with at most 150 N. With full assist, the force stays
+below a harness overload (500 N)."""
 FADE_RATE: Final = 30.0
-"""N/s with which the force goes once the robot no longer rises."""
+"""N/s; the force fades at this rate once the robot stops rising."""
 MOMENT_GAIN: Final = 80.0
 """N m/s per rad; with 200 a released torso swayed by 0.04 rad at 1 Hz."""
 MOMENT_FIRST: Final = 8.0
-"""N m at the release, a step of 4 N m at each hip."""
+"""N m; maximum at the release, a step of 4 N m at each hip."""
 MOMENT_MAX: Final = 30.0
-"""N m; `law.load_correction` accepts 20, and a person of 25 N at the harness adds 7."""
+"""N m; `law.load_correction` accepts 20, and 25 N of a person at the harness add 7."""
 MOMENT_FADE_RATE: Final = 30.0
-"""N m/s with which it goes once a hand leads the pitch."""
+"""N m/s; the moment fades at this rate once a hand leads the pitch."""
 _ROWS: Final = (2, 4)
 
 # Compared in each tick: docs/contributing.md, The control path.
@@ -142,7 +142,7 @@ _DOWN, _UP, _PERSON = Toward.DOWN, Toward.UP, Toward.PERSON
 
 
 Released = tuple[bool, bool]
-"""True if nobody leads the height, the pitch."""
+"""(height, pitch), each True while nobody leads it."""
 
 
 class HeightState(msgspec.Struct, array_like=True):
@@ -155,9 +155,9 @@ class HeightState(msgspec.Struct, array_like=True):
     pitch: float = 0.0
     """rad"""
     hold: Pair = (0.0, 0.0)
-    """How much of the height and of the pitch is used, 0 .. 1; 0: the person leads."""
+    """Weight of the closed height and pitch, 0 .. 1; at 0 the person leads."""
     fade_s: float = HOLD_S
-    """Time in which the hold fades, s."""
+    """Fade time of the hold, s."""
     force: float = 0.0
     """F_lift, N, upwards at the COM."""
     moment: float = 0.0
@@ -167,7 +167,7 @@ class HeightState(msgspec.Struct, array_like=True):
 
     @property
     def is_active(self) -> bool:
-        """True while height and pitch are not wholly the person's, or a force or moment is left."""
+        """True while height or pitch is closed, or a force or moment remains."""
         return any(self.hold) or self.force > 0.0 or self.moment != 0.0
 
     def apply(self, p_ref: Array, pdot_ref: Array) -> None:
@@ -180,15 +180,15 @@ class HeightState(msgspec.Struct, array_like=True):
                 pdot_ref[row] += hold * (rate - pdot_ref[row])
 
     def reset(self) -> None:
-        """End at once: the planner does not lead."""
+        """Open height and pitch at once, because the planner does not lead."""
         self.hold, self.rate, self.force, self.moment = (0.0, 0.0), 0.0, 0.0, 0.0
 
 
 class HeightReference:
-    """Closes height and pitch while the robot goes up or down by itself."""
+    """References that close height and pitch while no hand leads them."""
 
     def __init__(self, knees: Pair) -> None:
-        """Take the ends of the knees' way, theta in rad: the lowest pose, the highest."""
+        """Set the knees' theta at the lowest and at the highest pose, rad."""
         self._knees = knees
 
     def advance(
@@ -205,14 +205,14 @@ class HeightReference:
         """Advance by one tick; return the force, N, and the moment about pitch, N m.
 
         Args:
-            s: state of the closed directions, which changes.
-            toward: where to.
-            released: nobody leads the height, the pitch: closed where they are, if the robot goes
-                nowhere by itself.
-            drive: moment that turns a torso which nobody leads, N m.
+            s: state of the closed directions; updated in place.
+            toward: direction in which the robot moves on its own.
+            released: (height, pitch) that nobody leads; closed where they are, unless the robot
+                moves on its own.
+            drive: moment that turned the torso when its pitch was released, N m.
             p: measured pose (6,), m and rad.
             pdot: its rate (6,).
-            knees: theta of both, rad.
+            knees: theta of both knees, rad.
             dt: time since the last tick, s.
         """
         z, pitch = float(p[2]), float(p[4])

@@ -38,10 +38,10 @@ from shared.joints import N_JOINTS
 Y = 1
 """Row of p."""
 FAST = 0.04
-"""m/s; the integral takes no error that changes so fast: a shove, and the sway after it. With all
-of the error, a robot shoved to one side swung to the other twice as far as without an integral."""
+"""m/s; the integral ignores an error that changes faster, as in a shove and the sway after it. With
+the whole error, a shoved robot swung to the other side twice as far as without an integral."""
 GAIN_MIN = 1e-9
-"""Smallest gain of the body; a smaller one counts as zero."""
+"""Smallest gain of the body; smaller ones count as zero."""
 
 
 class UncoupledGains:
@@ -65,7 +65,7 @@ class UncoupledGains:
     def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
         """Return K_c and B_c (6, 6), symmetric and not negative: docs/law.md (16).
 
-        Zero at angles at which the closed chain has no finite rates: nothing can be added there.
+        Zero where the closed chain has no finite rates: nothing can be added there.
 
         Args:
             K_fail: stiffness of the local gains along p (6, 6).
@@ -74,7 +74,7 @@ class UncoupledGains:
         return self._lacking(self._stiffness, K_fail), self._lacking(self._damping, B_local)
 
     def _lacking(self, body: tuple[Array, Array], local: Array) -> Array:
-        """Return what local gains (6, 6) lack of the body's, given with its scale."""
+        """Return the part of the body's gains (with their scale) that local gains (6, 6) lack."""
         gains, scale = body
         lacking: Array = np.zeros((6, 6))
         scaled = (gains - local.take(self._indices)) / scale
@@ -97,22 +97,21 @@ def pole_gain(bandwidth_hz: float, dt: float) -> float:
 class PushIntegral:
     """F_I: force along y that grows against a lasting push, until the error is gone.
 
-    A push from the side is then borne by the coupled torque, whose load sharing asks little of a
-    sole, and no longer by the local springs, which bend the feet's shares until a sole tips:
+    The coupled torque then bears a push from the side, and its load sharing demands little of each
+    sole. The local springs alone would shift the feet's shares until a sole tips:
 
         F_I' = (1 - |e_y'| / FAST)+ K_p e_y / push_integral_s,    |F_I| <= push_integral_max
 
-    HOLD drops it with the coupled torque: `push_integral_max` is a push that HOLD stands. Along x
-    there is none: there HOLD has no such room.
+    HOLD drops F_I with the coupled torque, so `push_integral_max` is a push that HOLD withstands.
+    There is no integral along x, because HOLD has no such reserve there.
 
     Attributes:
-        gain: rate of the force per error, N/(m s); 0: the direction is led, or the split the
-            paper's. The dynamic certificate holds for any limit.
-        most: the limit, N.
+        gain: rate of the force per error, N/(m s); 0 if y is led or the split is the paper's.
+        most: maximum force, N. The dynamic certificate holds for any maximum.
     """
 
     def __init__(self, law: LawConfig) -> None:
-        """Set rate and limit."""
+        """Set rate and maximum."""
         closed = law.split == "certified" and not law.S[Y]
         self.gain = law.K_p[Y] / law.push_integral_s if closed else 0.0
         self.most = law.push_integral_max if closed else 0.0
@@ -122,8 +121,8 @@ class PushIntegral:
 
         Args:
             force: F_I before, N.
-            error: of y, m.
-            rate: of the error, m/s.
+            error: error of y, m.
+            rate: rate of the error, m/s.
             dt: time since the last tick, s.
         """
         slow = max(0.0, 1.0 - abs(rate) / FAST)
@@ -145,9 +144,9 @@ def low_passed(s: CouplingState, tau: Array, bandwidth_hz: float, dt: float) -> 
     """Return tau_coupled (12,), N m, after two equal poles: docs/law.md (18).
 
     Args:
-        s: both poles, which change.
-        tau: unfiltered (12,), N m.
-        bandwidth_hz: of each pole.
+        s: state of both poles; updated in place.
+        tau: unfiltered torque (12,), N m.
+        bandwidth_hz: bandwidth of each pole.
         dt: time since the last tick, s.
     """
     gain = pole_gain(bandwidth_hz, dt)
@@ -162,7 +161,7 @@ class _LawTerms(NamedTuple):
     """One tick's gains, and its coupled torque before any filter."""
 
     body_gains: Callable[[], JointGains]
-    """Computes K_q and B_q of all the body; the certified split does not need them."""
+    """Computes K_q and B_q of the whole body; the certified split does not need them."""
     local: LocalGains
     """D and D_B, certified."""
     coupled: Array

@@ -1,41 +1,41 @@
-"""The feet: their stance, the slope of the floor, and what the soles bear. Pure.
+"""Stance of the feet, slope of the floor, and loads of the soles. Pure.
 
-**Stance**, relative to the robot file. The law knows its feet by the joints alone. Both legs carry
-the same torso, so two estimates of one torso show a foot that is ahead, turned, or nearer than
-`geometry.w_base`. Before the planner engages, it adopts the stance in which the legs agree. It
-keeps that stance while engaged. No leg then works against the other, and each foot gets a wrench
-that its own position allows. With the feet taken from the file, 0.1 m too wide tipped a sole by
-0.18 rad; with the measured stance, by 0.002 rad.
+**Stance**, relative to the robot file. The law locates the feet from the joint angles alone. Both
+legs carry the same torso, so two estimates of one torso show a foot that is ahead, turned, or
+closer than `geometry.w_base`. Before the planner engages, it adopts the stance in which the legs
+agree, and keeps it while engaged. The legs then do not work against each other, and each foot gets
+a wrench that suits its position. With the file's stance, feet 0.1 m too wide tipped a sole by 0.18
+rad; with the measured stance, by 0.002 rad.
 
-While the planner is not engaged, the stance follows the joints slowly. Feet that were moved in HOLD
-are found, and a sole that lifts in a sway is not mistaken for one. A planner that has not been
-engaged yet cannot tell the two apart. If it starts while a push tips the soles, it keeps that
-stance until it disengages again.
+While the planner is not engaged, the stance follows the joints slowly. It then finds feet that were
+moved in HOLD, and ignores a sole that lifts briefly in a sway. A planner that has never engaged
+cannot tell the two apart. If it starts while a push tips the soles, it keeps that stance until it
+disengages.
 
-Zero errors of the joints become part of the stance: they look like feet that are slightly off. The
-planner refuses a stance beyond `law.stance_max`: it was not shown to stand, or something is broken.
+Zero errors of the joints look like slightly displaced feet, so they become part of the stance. The
+planner refuses a stance beyond `law.stance_max`: it is not shown to stand, or something is broken.
 
 **Slope**, from IMU and joints, as the direction of up in floor axes. The planner's axes are the
 floor's: z is the floor's normal (docs/law.md#slopes). On a slope, gravity leans in these axes by
 the slope's angle. A COM above the ankles along the floor's normal is then not above them along
 gravity. At a height of 1 m and 5 degrees it is 87 mm off, and the weight pulls it downhill.
 
-The IMU gives up in torso axes, and the joints give the torso's orientation on the floor:
+The IMU measures up in torso axes; the joints give the torso's orientation on the floor:
 
     up_floor = R_torso(q) up_torso,        low-passed by one pole of `imu.levelling_s`
 
-Zero errors of the ankles turn R_torso and so up_floor, but the COM is still controlled to be above
-the ankles. Zero errors of knees and hips also turn it; without an IMU they would not matter. Half a
-degree at both hips moves the COM by 8 mm.
+Zero errors of the ankles turn R_torso and thus up_floor, but the law still keeps the COM above the
+ankles. Zero errors of knees and hips turn it too, and matter only with an IMU: half a degree at
+both hips moves the COM by 8 mm.
 
-Deflection of flexible joints is not in q, so a sway looks like a floor that tilts. The slope is
-therefore followed slowly. A floor does not jump: without an IMU the last slope stays. If this
-planner never received one, the floor counts as level. An IMU first received while the planner is
-engaged is followed from level on.
+q lacks the deflection of flexible joints, so a sway looks like a tilting floor. The filter is
+therefore slow. The last slope stays if the IMU drops out, because a floor does not jump. A planner
+that never received an attitude assumes a level floor. If the first one arrives while the planner is
+engaged, the filter starts from level.
 
-**Soles**, by the joints' torques. A sole whose centre of pressure reaches its edge tips, and a
-robot that is led is soft against that: leaned on from the side it fell from 50 N on. HOLD is
-stiffer, and bears 65 N and more if it begins while both soles are flat.
+**Soles**, from the joint torques. A sole tips when its centre of pressure reaches its edge. A led
+robot is soft against that: it fell when leaned on from the side with 50 N or more. HOLD is
+stiffer: it withstands 65 N or more if it starts while both soles are flat.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ _ROWS: Final = (
     ("ahead of", "behind", "mm"),
     ("too near", "too far from", "mm"),
     ("higher than", "lower than", "mm"),
-    ("inner edge up against", "outer edge up against", "deg"),
-    ("pitched toes down against", "pitched toes up against", "deg"),
-    ("turned inwards against", "turned outwards against", "deg"),
+    ("tilted inner edge up relative to", "tilted outer edge up relative to", "deg"),
+    ("pitched toes down relative to", "pitched toes up relative to", "deg"),
+    ("turned inwards relative to", "turned outwards relative to", "deg"),
 )
-"""Right foot relative to the left: text for a positive and a negative row of a stance, and its
-unit."""
+"""Right foot relative to the left: text for a positive and for a negative row of a stance, and
+the unit."""
 _TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
 
 FOLLOW_S: Final = 2.0
@@ -78,12 +78,12 @@ class StanceState(msgspec.Struct):
     """Adopted stance of the right foot relative to the left, as deviation from the robot file:
     x, y, z in m and a rotation vector in rad, world axes."""
     refusal: str = ""
-    """Why the stance measured last is refused: it is beyond the limits, or the feet have moved and
-    their new stance is not adopted yet. "" if it is accepted."""
+    """Reason for refusing the last measured stance: it exceeds the limits, or the feet have moved
+    and their new stance is not adopted yet. "" if it is accepted."""
 
 
 class Stance:
-    """Follows the stance of the feet within limits."""
+    """Stance of the feet, followed within limits."""
 
     def __init__(self, stance_max: Sequence[float]) -> None:
         """Set the limits.
@@ -97,9 +97,9 @@ class Stance:
         """Adopt the stance in which the legs agree now.
 
         Args:
-            s: the stance, which changes.
-            measured: (6,), m and rad.
-            fraction: of the way to it; 1 adopts it at once.
+            s: the stance; updated in place.
+            measured: measured stance (6,), m and rad.
+            fraction: step towards it, as a fraction; 1 adopts it at once.
         """
         if not np.isfinite(measured).all():  # nothing to follow
             s.refusal = "the joint angles give no stance: check the encoders"
@@ -128,8 +128,8 @@ class Stance:
 
 
 SLOPE_MAX: Final = 0.12
-"""rad each way, 7 degrees. This robot stands on no steeper floor, so a larger value means an IMU
-that has come loose, and is ignored."""
+"""rad each way, 7 degrees. This robot cannot stand on a steeper floor, so a larger value means a
+loose IMU and is ignored."""
 
 
 class LevellingState(msgspec.Struct):
@@ -159,11 +159,11 @@ class Levelling:
         """Update the slope with the IMU's newest attitude.
 
         Args:
-            s: the slope, which changes.
-            up_torso: unit vector against gravity, torso axes; None if it is not known now.
+            s: the slope; updated in place.
+            up_torso: unit vector against gravity, torso axes; None if unknown.
             angles: the torso's roll, pitch and yaw on the floor from the joints, rad.
             dt: time since the last call, s.
-            jump: the planner is not engaged: take the first known slope at once.
+            jump: adopt the first known slope at once, because the planner is not engaged.
         """
         if up_torso is None:
             return
@@ -188,9 +188,9 @@ def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
 
     Args:
         up_torso: unit vector against gravity, torso axes.
-        roll: of the torso on the floor, rad; R = Rz(yaw) Rx(roll) Ry(pitch).
-        pitch: of the torso on the floor, rad.
-        yaw: of the torso on the floor, rad.
+        roll: torso roll on the floor, rad; R = Rz(yaw) Rx(roll) Ry(pitch).
+        pitch: torso pitch on the floor, rad.
+        yaw: torso yaw on the floor, rad.
     """
     x, y, z = up_torso
     x, z = math.cos(pitch) * x + math.sin(pitch) * z, math.cos(pitch) * z - math.sin(pitch) * x
@@ -204,7 +204,7 @@ def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
 ANKLES = tuple(2 * MODULE_INDEX[f"ankle_{side}"] for side in SIDES)
 """Indices of the ankles' phi among the joints."""
 LOAD_MIN = 50.0
-"""N; a sole that bears less counts as one that bears this."""
+"""N; `Soles.edge` raises a smaller load to this, and `Soles.tipping` ignores its sole."""
 
 
 class Soles:
@@ -217,24 +217,24 @@ class Soles:
         self._at_rest = 0.5 * (config.total_mass * GRAVITY + config.leg_weight)
 
     def loads(self, leg_loads: Pair) -> Pair:
-        """Return what the soles bear, N: the legs' forces on the torso, and their own weight.
+        """Return the loads of the soles, N: each leg's force on the torso plus the leg's weight.
 
-        NaN for a leg whose force is not known.
+        NaN for a leg whose force is unknown.
 
         Args:
-            leg_loads: of the right and the left leg, N (`Measured.leg_loads`).
+            leg_loads: forces of the right and the left leg, N (`Measured.leg_loads`).
         """
         right, left = leg_loads
         return right + self._leg_weight, left + self._leg_weight
 
     def edge(self, tau: Array, loads: Pair) -> float:
-        """Return how far out a sole's pressure is sideways: 0 below the ankle, 1 at its edge.
+        """Return the soles' larger lateral offset of pressure: 0 below the ankle, 1 at the edge.
 
-        The larger one of both; a load that is not known counts as half of the weight.
+        An unknown load counts as half of the weight.
 
         Args:
             tau: joint torques (12,), N m.
-            loads: of the soles, N.
+            loads: loads of the soles, N.
         """
         out = 0.0
         for ankle, load in zip(ANKLES, loads, strict=True):
@@ -243,13 +243,13 @@ class Soles:
         return out / self._half_width
 
     def tipping(self, tau: Array, loads: Pair) -> float:
-        """Return how far out a sole's pressure is in any direction: 1 at an edge, toe or heel.
+        """Return the soles' larger offset of pressure in any direction: 1 at edge, toe or heel.
 
-        The larger one of both. A sole of unknown load, or under `LOAD_MIN`, counts as 0.
+        A sole whose load is unknown or below `LOAD_MIN` counts as 0.
 
         Args:
             tau: joint torques (12,), N m.
-            loads: of the soles, N.
+            loads: loads of the soles, N.
         """
         out = 0.0
         for ankle, load in zip(ANKLES, loads, strict=True):

@@ -60,16 +60,16 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULE_INDEX, N_JOINTS, SIDES
 
 RECENTRED = np.array([True, True, False, True, False, True])
-"""Rows of p whose closed-loop reference returns to zero: no roll or yaw, and the COM above the
-ankles along gravity. Along the floor's normal the COM is off them by its height times the floor's
-slope."""
+"""Rows of p whose closed-loop reference returns to zero: roll, yaw, and the COM's offset from the
+ankles along gravity. On a slope, the COM is off the floor's normal through the ankles by height
+times slope."""
 
 _PERSON: Final = Toward.PERSON
 KNEES = tuple(2 * MODULE_INDEX[f"knee_{side}"] + 1 for side in SIDES)
 """Indices of the knees' theta among the joints."""
 
 KEPT = np.where(RECENTRED, 0.0, 1.0)
-"""1 for the rows of p_C that stay."""
+"""1 for the rows of p_C that keep their value, 0 for those that return to zero."""
 
 
 class LawInputs(NamedTuple):
@@ -85,30 +85,30 @@ class LawInputs(NamedTuple):
     """Assist that the operator requests, N. The law limits its rate, except in the first tick,
     which takes over the assist that HOLD carries."""
     shed_rate: float = 0.0
-    """N/s with which the assist may fall, if that is more than the law's own limit."""
+    """Maximum rate at which the assist falls, N/s, if above the law's own limit."""
     shift: Vector4 = STRAIGHT
     """Requested x, y (m), roll and yaw (rad) of the shift; limited by the law."""
     toward: Toward = Toward.PERSON
-    """Where the robot goes without a hand (`services.planner.law.closed_reference`)."""
+    """Where the robot moves on its own (`services.planner.law.closed_reference`)."""
     released: Released = (False, False)
-    """True if nobody leads the height, the pitch."""
+    """(height, pitch), each True while nobody leads it."""
     pitch_drive: float = 0.0
-    """Acceleration of a pitch that nobody leads, rad/s^2."""
+    """Pitch acceleration measured when the pitch was released, rad/s^2."""
     align: bool = False
     """Start from the measured pose, so that engaging makes no step. p_C starts at the measured pose
-    and returns to zero (COM over the ankles, no roll, no yaw; height and pitch stay) during
+    and returns to zero (COM over the ankles, no roll, no yaw; height and pitch stay) over
     `law.recentre_s` of ticks without `align`. A planner that was engaged before starts from p_C = 0
-    instead. The pose it finds is then part of a sway, and after another drop-out HOLD would stay at
-    that pose. A robot held off centre by 25 mm fell at the second push. The modules' blend avoids a
-    step in this case. The requested shift is kept."""
+    instead, because the measured pose is then part of a sway. HOLD would keep it after another
+    dropout, and a robot held 25 mm off centre fell at the second push. The modules' blend then
+    avoids a step. The requested shift is kept."""
     wrench: Wrench | None = None
-    """Wrench of the operator on the torso, if it is fresh and valid."""
+    """Operator's wrench on the torso; None if stale or invalid."""
     up_torso: Vector3 | None = None
-    """Unit vector against gravity, torso axes; None if the IMU does not know it now."""
+    """Unit vector against gravity, torso axes; None if the attitude is unknown."""
 
 
 class LawOutput(NamedTuple):
-    """Outputs of one tick for the twelve joints, (12,) where no other shape is given."""
+    """Outputs of one tick for the twelve joints, (12,) unless another shape is given."""
 
     q_ref: Array
     v_ref: Array
@@ -129,7 +129,7 @@ class LawOutput(NamedTuple):
     slope: Pair
     """Rise of the floor along x and y, rad."""
     stance: Vector6
-    """The right foot relative to the left, as deviation from the robot file, m and rad."""
+    """Right foot relative to the left, as a deviation from the robot file, m and rad."""
     ik_iterations: int
     ik_residual: float
 
@@ -143,7 +143,7 @@ class LawState(msgspec.Struct):
     aligned: bool = False
     has_led: bool = False
     q: tuple[float, ...] = (0.0,) * N_JOINTS
-    """Joint angles from which the inverse kinematics begins, rad."""
+    """Joint angles from which the inverse kinematics starts, rad."""
     stance: StanceState = msgspec.field(default_factory=StanceState)
     levelling: LevellingState = msgspec.field(default_factory=LevellingState)
     shift: ShiftState = msgspec.field(default_factory=ShiftState)
@@ -155,12 +155,12 @@ class LawState(msgspec.Struct):
 
 
 class Hocca:
-    """The law; all that changes from tick to tick is in `LawState`.
+    """The whole-body law. Everything that changes between ticks is in `LawState`.
 
     Attributes:
         measured: results at the measured joints of the last tick.
         reference: results at the last tick's reference pose.
-        split: of the gains, with their certificate.
+        split: split of the gains, with their certificate.
         load: estimate of the load beyond the robot file.
     """
 
@@ -182,7 +182,7 @@ class Hocca:
         self._weight = config.total_mass * GRAVITY
         size = config.geometry.torso_size
         inertia = config.torso_mass * (size[0] ** 2 + size[2] ** 2) / 12.0
-        # the paper's split serves for comparison only: no load correction is added to it
+        # the paper's split is for comparison only, so it gets no load correction
         certified = config.law.split == "certified"
         correction_max = config.law.load_correction if certified else (0.0, 0.0)
         self.load = Load(correction_max, self._weight, config.torso_mass, inertia)
@@ -194,8 +194,8 @@ class Hocca:
         """Run the law once: docs/law.md (6), (12) and (17).
 
         Args:
-            s: the law's state, which changes.
-            inputs: of this tick.
+            s: the law's state; updated in place.
+            inputs: inputs of this tick.
         """
         measured, reference, dt = self.measured, self.reference, inputs.dt
         up = self._measure(s, inputs)
@@ -210,8 +210,8 @@ class Hocca:
         result = reference.solve(np.array(s.q), p_ref)
         terms = self._terms.evaluate(reference, p_ref - measured.p, pdot_ref - measured.pdot)
         tau_unfiltered, tau_coupled = self._coupled_torque(s, terms.coupled, p_ref, pdot_ref, dt)
-        # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlive the
-        # hand. It is a force fed forward, not fed-back joint rates, so the harness filter is enough
+        # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlast the
+        # hand. It feeds forward a force, not joint rates, so the harness filter is enough
         ease_z, ease_pitch = self._easing.ease(s.easing, force, moment_pitch, assist, dt)
         tau_coupled += ease_z * reference.J_harness[2] + ease_pitch * reference.J[4]
         s.q = tuple(reference.expected(dt).tolist())
@@ -236,7 +236,7 @@ class Hocca:
         )
 
     def _measure(self, s: LawState, inputs: LawInputs) -> Array:
-        """Evaluate p, J and pdot on the feet's stance; return the direction of up (3,)."""
+        """Evaluate p, J and pdot in the feet's stance; return the up direction (3,)."""
         measured, aligns = self.measured, inputs.align or not s.aligned
         if aligns:
             fraction = min(1.0, inputs.dt / FOLLOW_S) if s.has_led else 1.0
@@ -251,7 +251,7 @@ class Hocca:
     def _closed_loop_reference(
         self, s: LawState, inputs: LawInputs, up: Array
     ) -> tuple[Array, Array]:
-        """Return p_C and its rate (6,): the way back to zero, the shift and the floor's slope."""
+        """Return p_C and its rate (6,): the return to zero, the shift and the floor's slope."""
         p, pdot = self.measured.p, self.measured.pdot
         lean = up[:2] / up[2]
         if inputs.align or not s.aligned:
@@ -260,7 +260,7 @@ class Hocca:
             p_C0[:2] -= lean * p[2]
             p_C0 *= np.where(RECENTRED & s.has_led, 0.0, self._S_perp)
             s.p_C0, s.q, s.coupling = vector6(p_C0), tuple(inputs.q.tolist()), CouplingState()
-            s.shift.rest()
+            s.shift.stop()
             s.height.reset()
         else:
             s.has_led = True
@@ -273,18 +273,18 @@ class Hocca:
         return p_C, pdot_C
 
     def _hand(self, s: LawState, inputs: LawInputs) -> tuple[float | None, float, float]:
-        """Advance the assist; return what the hand leads, and the assist's rate.
+        """Advance the assist; return the hand's lead and the assist's rate.
 
         Returns:
-            The operator's upward force, N, world; None if unknown, or if the hand leads no height.
-            The moment about pitch, N m; 0 if the hand leads no pitch. The assist's rate, N/s.
+            The operator's upward force, N, world; None if unknown or if the height is closed. The
+            pitch moment, N m; 0 if unknown or if pitch is closed in place. The assist's rate, N/s.
         """
         p, pdot, wrench = self.measured.p, self.measured.pdot, inputs.wrench
         held_z, held_pitch = s.height.hold
         goes = inputs.toward is not _PERSON
         force, moment_pitch = None, 0.0
         if wrench is not None:
-            if not goes and held_z == 0.0:  # else its force is no error of the assist
+            if not goes and held_z == 0.0:  # force on a closed height is no assist error
                 force = force_up(wrench.force, p[3], p[4])
             if goes or held_pitch == 0.0:
                 moment_pitch = wrench.moment[1]
@@ -299,7 +299,7 @@ class Hocca:
     def _body_wrench(
         self, s: LawState, inputs: LawInputs, up: Array, p_ref: Array, pdot_ref: Array
     ) -> Array:
-        """Return F_O (6,), N and N m; close the height and the pitch that no hand leads."""
+        """Return F_O (6,), N and N m; close height and pitch if no hand leads them."""
         measured, height = self.measured, s.height
         F_O: Array = np.zeros(6)
         F_O[:3] = self._weight * up
@@ -325,7 +325,7 @@ class Hocca:
     def _coupled_torque(
         self, s: LawState, coupled: Array, p_ref: Array, pdot_ref: Array, dt: float
     ) -> tuple[Array, Array]:
-        """Return J^T [K_c e + B_c e' + F_I] (12,), N m, and the same low-passed: tau_coupled."""
+        """Return J^T [K_c e + B_c e' + F_I] (12,), N m, and its low-pass, tau_coupled."""
         e_y = float(p_ref[Y] - self.measured.p[Y])
         rate = float(pdot_ref[Y] - self.measured.pdot[Y])
         s.coupling.push = self._push.after(s.coupling.push, e_y, rate, dt)
@@ -334,11 +334,11 @@ class Hocca:
         return tau_unfiltered, low_passed(s.coupling, tau_unfiltered, bandwidth_hz, dt)
 
     def rest_from_here(self, D: Array, torque: Array) -> Array:
-        """Return how far p (6,) goes until local gains alone balance a torque, m and rad.
+        """Return the displacement of p (6,) at which local gains alone balance a torque, m and rad.
 
         Args:
             D: local stiffness (12,), N m/rad, certified at this tick.
-            torque: beyond what balances the body here (12,), N m.
+            torque: torque beyond the one that balances the body here (12,), N m.
         """
         K_fail = self.split.certificate.failsafe_stiffness(D)
         return np.asarray(np.linalg.solve(K_fail, self.reference.T.T @ torque), float)
@@ -349,12 +349,12 @@ class Hocca:
         """Update the estimate of the load beyond the robot file, at the last tick's pose.
 
         Args:
-            s: state of the estimate, which changes.
+            s: state of the estimate; updated in place.
             tau: measured joint torques (12,), N m.
             v: joint rates (12,), rad/s.
-            wrench: of the operator on the torso; None if it is not known.
+            wrench: operator's wrench on the torso; None if unknown.
             dt: time since the last tick, s.
-            led: the planner is engaged.
+            led: True while the planner is engaged.
         """
         if not self.load.enabled:
             return
@@ -381,11 +381,11 @@ class Hocca:
 def _recentred(p_C0: Array, since_s: float, recentre_s: float) -> tuple[Array, Array]:
     """Return p_C and its rate (6,): a minimum-jerk path from p_C0 to zero.
 
-    Height and pitch stay where they were found, if they are closed: at zero nothing stands.
+    Closed height and pitch keep their initial values, because no robot stands at height zero.
 
     Args:
-        p_C0: pose at its beginning (6,), m and rad.
-        since_s: time since then, s.
+        p_C0: initial pose (6,), m and rad.
+        since_s: time since the start of the path, s.
         recentre_s: duration of the path, s.
     """
     if since_s >= recentre_s:

@@ -1,9 +1,9 @@
-"""Solves the inverse kinematics with both feet on the ground (docs/law.md).
+"""Inverse kinematics with both feet on the ground (docs/law.md).
 
 Six task rows (p = p_ref) and six closure rows (both legs agree on the torso) form a square system
-in the 12 joint angles. From a solution near by, Gauss-Newton takes one or two steps. A tick needs
-it only where the single step of `services.planner.law.reference` is too long, or at a joint limit.
-`tools.reach` solves from anywhere.
+in the 12 joint angles. From a nearby solution, Gauss-Newton takes one or two steps. A tick needs
+this solver only if the steps of `services.planner.law.reference` fail or reach a joint limit.
+`tools.reach` solves from any pose.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ STEP_MAX = 0.2
 """rad; a longer step leaves the region in which the linearisation is good."""
 
 GAIN_AT_LIMIT = 0.01
-"""Least reduction, as a fraction of the sum of squares. With smaller steps, out of reach, the legs
-would creep into a twist."""
+"""Minimum reduction at a limit, as a fraction of the sum of squares. With smaller steps, out of
+reach, the legs would creep into a twist."""
 
 
 class IkResult(NamedTuple):
@@ -67,7 +67,7 @@ class InverseKinematics:
             p_ref: (6,), m and rad.
             D_left: load sharing to use, as in `Kinematics.update`; where the legs agree it changes
                 J but not p.
-            iterations_max: largest number of Gauss-Newton steps.
+            iterations_max: maximum number of Gauss-Newton steps.
         """
         residual = self._residual(p_ref, D_left)
         iterations = 0
@@ -83,7 +83,7 @@ class InverseKinematics:
                 return IkResult(iterations, largest * largest)
             after = self._residual(p_ref, D_left)
             gained = cost - float(self._error @ self._error)
-            long_step = not limited and largest >= STEP_MAX / 2  # it may have to go uphill first
+            long_step = not limited and largest >= STEP_MAX / 2  # it may go uphill first
             if not long_step and gained < (GAIN_AT_LIMIT * cost if limited else 0.0):
                 self.q[:] = before
                 return IkResult(iterations, self._residual(p_ref, D_left))
@@ -145,5 +145,5 @@ class InverseKinematics:
 
 
 def limited_length(step: Array, largest: float) -> Array:
-    """Return a step of the same direction with no part above `largest`."""
+    """Return the step, shortened until no element exceeds `largest`."""
     return step * (largest / max(largest, float(np.abs(step).max())))

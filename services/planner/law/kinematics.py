@@ -1,4 +1,4 @@
-"""Evaluates the pose p, its Jacobian and the Hessian term as numbers (paper section IV).
+"""Pose p, its Jacobian and the Hessian term, evaluated as numbers (paper section IV).
 
 p = [COM x y z; torso roll pitch yaw]. The load-sharing matrices D mix the two legs' estimates of
 the torso: J_torso = [D_R^T J_R, D_L^T J_L]. J^T F then requests from each foot a wrench that its
@@ -25,8 +25,8 @@ _GRAPHS: Final[dict[tuple[MassConfig, GeometryConfig, LawConfig], symbolic.Graph
 """Graphs per robot. A process builds each once, because that takes a tenth of a second."""
 _GRAPHS_KEPT: Final = 16
 DETERMINANT_MIN: Final = 0.05
-"""m^3, of a leg's Jacobian. Straighter or more folded legs (outside 0.79 to 1.27 m) give no wrench,
-because 1 N m of friction would be more than 10 N."""
+"""m^3; smallest determinant of a leg's Jacobian. Straighter or more folded legs (outside 0.79 to
+1.27 m) give no wrench, because 1 N m of friction would count as more than 10 N."""
 
 
 class Kinematics:
@@ -43,7 +43,7 @@ class Kinematics:
     The caller writes:
 
     - `stance` (6,): pose of the right foot relative to the left, as deviation from the robot file:
-      x, y, z in m and a rotation vector in rad, world axes. The world is midway between the feet.
+      x, y, z in m and a rotation vector in rad, world axes. The origin is midway between the feet.
     """
 
     def __init__(self, config: RobotConfig) -> None:
@@ -103,7 +103,7 @@ class Kinematics:
 
 
 class Measured:
-    """What a tick needs at the measured joints.
+    """Kinematics of a tick at the measured joints.
 
     `update` writes these arrays, and the next call overwrites them: `D_left`, `p`, `closure`, `J`,
     `C` and `J_harness` as in `Kinematics`, and `pdot` (6,): J v, m/s and rad/s.
@@ -138,10 +138,10 @@ class Measured:
         return self._stance.results[0]
 
     def leg_loads(self, tau: Array) -> tuple[float, float]:
-        """Return the upward force of right and left leg on the torso, N; NaN if it is not known.
+        """Return the upward force of right and left leg on the torso, N; NaN if unknown.
 
-        Straight and folded legs give none (`DETERMINANT_MIN`). A leg carries part of its own
-        weight, which is not subtracted.
+        It is unknown for straight and folded legs (`DETERMINANT_MIN`). A leg carries part of its
+        own weight, which is not subtracted.
 
         Args:
             tau: joint torques (12,), N m.

@@ -1,24 +1,24 @@
-"""Estimates the torso's load beyond the robot file: its weight and its position. Pure.
+"""Estimate of the torso's load beyond the robot file: its weight and its position. Pure.
 
 The open directions have no stiffness, so an unknown weight moves the robot as soon as nobody holds
-on. A momentum observer estimates it from the joint torques. F is the wrench along p that joints and
-person (w_h) hold up, n the rise of the harness point along p, M the torso's mass:
+it. A momentum observer estimates the weight from the joint torques. F is the wrench along p that
+joints and person (w_h) support, n the rise of the harness point along p, M the torso's mass:
 
     F         = T^T (tau + J_harness^T f_h + J_pitch^T m_h)       [J; C] T = [I; 0]
     n         = T^T J_harness,z
     dm g      = (F_z - m g) / n_z - M zddot_harness
     a cos(pitch) + b sin(pitch) = F_pitch - n_pitch dm g - I pitchddot
 
-a and b are the moments that hold up the surplus weight about the harness point, torso axes, N m. a
-depends on how far behind it lies, b on how low. Both are low-passed, and reduced by the amount that
-dry friction in the joints hides. They are fed forward like the assist, and so are part of every
-tick's certificate. Beyond `law.load_correction` the planner does not engage, because schedule and
-studies then describe another robot. A harness error f_h counts as load.
+a and b are the moments that support the surplus weight about the harness point, torso axes, N m. a
+depends on how far behind the weight lies, b on how low. The estimate is low-passed, and reduced by
+the amount that dry friction in the joints hides. It is fed forward like the assist, so it is part
+of every tick's certificate. Beyond `law.load_correction` the planner does not engage, because
+schedule and studies then describe another robot. An error of the harness counts as load.
 
-The planner does not engage on a robot that hangs on a hoist either. Its feedforward would lift the
-robot off the hoist. With the payload missing it would lift it to straight legs (0.1 m up), where
-torques do not show the load. It holds until the feet carry the file's weight within the limit. That
-check needs no harness, because no hand lifts half the robot.
+The planner does not engage on a robot that hangs on a hoist either: the feedforward would lift it
+off. If its payload is missing, the feedforward would lift it to straight legs (0.1 m up), where
+torques do not show the load. The planner holds until the feet carry the file's weight within the
+limit. This check needs no harness, because no hand lifts half the robot.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ STILL_RATES: Final = (0.05, 0.1)
 FRICTION_BAND: Final = (8.0, 1.5)
 """N and N m of the open directions that dry friction may hide (0.3 N m a joint: 6 N)."""
 WEIGHING_S: Final = 1.0
-"""s; after the robot hung, the load must be within the limits this long: four time constants."""
+"""s; time for which a lowered robot's load must stay within the limits: four time constants."""
 RESUME_FRACTION: Final = 0.8
 """Fraction of the limits within which a refused load is accepted again."""
 CARRIED_FRACTION: Final = 0.25
-"""Fraction of the file's weight; with less on its feet, a robot in TRACK falls, or hangs."""
+"""Fraction of the file's weight; with less on its feet, a robot in TRACK is falling or hanging."""
 HANGING_FRACTION: Final = 0.5
 """Fraction of the file's weight; with less on its feet, a robot in HOLD hangs on a hoist."""
 
@@ -60,15 +60,15 @@ class LoadState(msgspec.Struct):
     b: float = 0.0
     """N m along pitch, for a load below (+) or above it, with the torso at 90 degrees."""
     rates: Pair | None = None
-    """At the last estimate; None while it pauses: a state is stale, or a leg hides the load."""
+    """Rates at the last estimate; None while it pauses (stale state, or a leg hides the load)."""
     refused: bool = False
     weighing_s: float = 0.0
     looked: bool = False
-    """It has looked whether the robot hangs, once."""
+    """True once the first update has checked whether the robot hangs."""
 
     @property
     def blocks(self) -> bool:
-        """True while the load differs too much from the file, or is not known yet."""
+        """True while the load differs too much from the file, or is still unknown."""
         return self.refused or self.weighing_s > 0.0
 
     def moment(self, pitch: float) -> float:
@@ -84,64 +84,65 @@ class Load:
 
         Args:
             correction_max: `law.load_correction`: kg and N m; zero disables the estimate.
-            weight: of the whole robot by the file, N.
-            mass: of its torso, kg.
-            inertia: of its torso about pitch, kg m^2.
+            weight: weight of the whole robot in the file, N.
+            mass: mass of the torso, kg.
+            inertia: inertia of the torso about pitch, kg m^2.
         """
         self._kg_max, self._moment_max = correction_max
         self.enabled = any(correction_max)
         self._weight, self._mass, self.inertia = weight, mass, inertia
 
     def refusal(self, s: LoadState) -> str:
-        """Return why the load is refused and how to fix it, as text; "" if it is accepted."""
+        """Return the reason for refusing the load and the remedy; "" if it is accepted."""
         if not s.refused:
             return "its load is being weighed" if s.weighing_s > 0.0 else ""
         if self._is_hung(s):
             return (
-                "it hangs: lower it until its feet bear its weight; or, on its feet, it carries "
-                f"{-s.kg:.0f} kg less than its file says: set mass.payload, then `xrl gains`"
+                "the robot hangs: lower it until its feet bear its weight. If it stands, it "
+                f"carries {-s.kg:.0f} kg less than the robot file says: set mass.payload, "
+                "then run `xrl gains`"
             )
         reasons = []
         if abs(s.kg) > RESUME_FRACTION * self._kg_max:
             more = "more" if s.kg > 0.0 else "less"
             held_up = "" if s.kg > 0.0 else " and nothing holds it up"
             reasons.append(
-                f"the robot carries {abs(s.kg):.1f} kg {more} than its file says, or its harness "
-                f"measures wrongly: at most {self._kg_max:g} kg are accepted "
-                f"({RESUME_FRACTION * self._kg_max:g} once refused); tare the unloaded harness "
-                f"(`xrl drive tare`) first; if that changes nothing{held_up}, set mass.payload, "
-                "then `xrl gains`"
+                f"the robot carries {abs(s.kg):.1f} kg {more} than the robot file says, or its "
+                f"harness measures wrongly: at most {self._kg_max:g} kg is accepted "
+                f"({RESUME_FRACTION * self._kg_max:g} once refused). First tare the unloaded "
+                f"harness (`xrl drive tare`); if that changes nothing{held_up}, set mass.payload, "
+                "then run `xrl gains`"
             )
         for moment, positive, negative in ((s.a, "behind", "ahead"), (s.b, "low", "high")):
             if abs(moment) > RESUME_FRACTION * self._moment_max:
                 reasons.append(
                     f"the load lies too far {positive if moment > 0.0 else negative}, by "
-                    f"{abs(moment):.0f} N m: at most {self._moment_max:g} N m are accepted "
+                    f"{abs(moment):.0f} N m: at most {self._moment_max:g} N m is accepted "
                     f"({RESUME_FRACTION * self._moment_max:g} once refused)"
                 )
         return "; ".join(reasons)
 
     def force(self, s: LoadState) -> float:
-        """Return the part of the weight beyond friction, N at the harness point; limited."""
+        """Return the surplus weight beyond friction, N at the harness point, within the limit."""
         return _deadband(GRAVITY * s.kg, FRICTION_BAND[0], GRAVITY * self._kg_max)
 
     def moment(self, s: LoadState, pitch: float) -> float:
-        """Return the part of its pitch moment beyond friction, N m, within the limit."""
+        """Return the surplus pitch moment beyond friction, N m, within the limit."""
         return _deadband(s.moment(pitch), FRICTION_BAND[1], self._moment_max)
 
     def advance(
         self, s: LoadState, F: Array, n: Array, pitch: float, rates: Pair, dt: float, *, led: bool
     ) -> None:
-        """Update with the wrench that joints and person hold up.
+        """Update with the wrench that joints and person support.
 
         Args:
-            s: state of the estimate, which changes.
+            s: state of the estimate; updated in place.
             F: wrench along p (6,), N and N m, world.
             n: rise of the harness point along p (6,), m/m and m/rad.
-            pitch: of the torso, rad.
-            rates: of the harness point's height, m/s, and of the torso's pitch, rad/s.
+            pitch: torso pitch, rad.
+            rates: rates of the harness point's height, m/s, and of the torso's pitch, rad/s.
             dt: time since the last call, s.
-            led: the planner is engaged.
+            led: True while the planner is engaged.
         """
         before, s.rates = s.rates, rates
         surplus = float(F[2]) - self._weight
@@ -169,10 +170,10 @@ class Load:
             s.weighing_s = WEIGHING_S if s.refused else max(0.0, s.weighing_s - dt)
 
     def advance_without_harness(self, s: LoadState, F_z: float, dt: float, *, led: bool) -> None:
-        """Update with the joints' force along z, N, without a harness; check only if it hangs.
+        """Update without a harness, from the joints' force along z, N: check only if it hangs.
 
-        Without a harness a load cannot be distinguished from a hand. Once the robot is lowered, the
-        file's load is accepted.
+        Without a harness, a load cannot be distinguished from a hand. Once the robot is lowered,
+        the file's load is accepted.
         """
         surplus, s.rates = F_z - self._weight, None
         if self._hangs_at_start(s, surplus, led=led) or s.weighing_s == 0.0:
@@ -188,12 +189,12 @@ class Load:
     def _hangs_at_start(self, s: LoadState, surplus: float, *, led: bool) -> bool:
         """Return True at the first update of a robot that hangs.
 
-        From then on it is weighed, and the planner does not engage before the load is known.
+        Its load is then weighed, and the planner does not engage before it is known.
 
         Args:
-            s: state of the estimate, which changes.
+            s: state of the estimate; updated in place.
             surplus: force on the feet beyond the file's weight, N.
-            led: the planner is engaged.
+            led: True while the planner is engaged.
         """
         first, s.looked = not s.looked, True
         hangs = first and not led and surplus < (HANGING_FRACTION - 1.0) * self._weight

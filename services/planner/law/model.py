@@ -1,9 +1,9 @@
-"""Loads the robot model into Pinocchio and extracts each leg's screw axes, foot upwards.
+"""Robot model in Pinocchio, and each leg's screw axes from the foot up.
 
-Pinocchio reads the MJCF that `shared.robot.robot_model` generates, the only model source. Its root
-is the torso. The law needs each leg from the foot upwards, because the feet stand still: the six
-screw axes of a leg in the foot's frame, and the torso's position at q = 0. The product of
-exponentials is T_torso(q) = exp(s_1 q_1) ... exp(s_6 q_6) T_torso(0).
+Pinocchio reads the MJCF that `shared.robot.robot_model` generates, the only source of the model.
+Its root is the torso. The feet stand still, so the law needs each leg from the foot up: the leg's
+six screw axes in the foot's frame, and the torso's position at q = 0. The product of exponentials
+is T_torso(q) = exp(s_1 q_1) ... exp(s_6 q_6) T_torso(0).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class LegGeometry(NamedTuple):
     r_foot: Array
     """Ankle (3,), m."""
     axes: Array
-    """Unit joint axes (6, 3), from the foot up. A positive angle turns the torso's side."""
+    """Unit joint axes (6, 3), from the foot up. A positive angle turns the link above the joint."""
     points: Array
     """A point on each axis (6, 3), m."""
     r_knee: Array
     """Knee (3,), m."""
     r_torso: Array
-    """Torso origin as this leg carries it (3,), m. The torso's axes are the world's."""
+    """Torso origin by this leg (3,), m. The torso's axes are the world's."""
 
 
 def load_pinocchio(config: RobotConfig) -> pin.Model:
@@ -122,7 +122,7 @@ class HangingLegs:
         self._data = self._model.createData()
 
     def inertia(self, q: Array) -> Array:
-        """Return the inertia about each joint (12,), kg m^2, the others held; without its rotor.
+        """Return the inertia about each joint (12,), kg m^2, with the others held, without rotor.
 
         Args:
             q: joint angles (12,), rad.
@@ -131,7 +131,7 @@ class HangingLegs:
         return np.asarray(np.diag(M)[6 + _TREE_OF_LEG.ravel()], float)
 
     def torque(self, q: Array) -> Array:
-        """Return the torques that hold the legs up (12,), N m.
+        """Return the torques that hold up the hanging legs (12,), N m.
 
         Args:
             q: joint angles (12,), rad.

@@ -1,10 +1,10 @@
-"""Solves the reference of a tick, and evaluates what the law needs there, in one graph. Pure.
+"""Reference pose of a tick, and the law's quantities there, from one graph. Pure.
 
 The graph (`services.planner.law.symbolic`) makes one Gauss-Newton step of the inverse kinematics
-from where the last reference was going. While the planner leads, that step is shorter than
-`STEP_SURE`, so its error is below the solver's tolerance and nothing is evaluated twice. While it
-holds, two steps lead from the measured pose to the middle. What takes more than `STEPS_MAX` steps,
-or leaves the joint limits, goes to `InverseKinematics`, and the graph is evaluated where that ends.
+from the extrapolated last reference. While the planner leads, that step is below `STEP_SURE`, so
+its error is within the solver's tolerance and nothing is evaluated twice. While it holds, two steps
+lead from the measured pose to the centred one. If `STEPS_MAX` steps are too few, or one leaves the
+joint limits, `InverseKinematics` solves, and the graph is evaluated at its solution.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.compiled_graph import CompiledGraph
 
 STEPS_MAX: Final = 3
-"""Steps by the graph; near a solution each squares the error. What needs more is not near."""
+"""Maximum steps by the graph. Near a solution each step squares the error."""
 
 
 class _ReferenceInputs(msgspec.Struct, frozen=True):
-    """Arguments of the graph, in its order: `Reference` writes all arrays but `stance`."""
+    """Arguments of the graph, in its order. `Reference` writes all arrays except `stance`."""
 
     q: Array
     """Joint angles (12,), rad, at which the graph is evaluated."""
     stance: Array
-    """The right foot relative to the left (6,), as in `Kinematics`; the caller writes it."""
+    """Right foot relative to the left (6,), as in `Kinematics`; the caller writes it."""
     D_left: Array
     """Load sharing (6, 6), chosen at the measured pose."""
     p_ref: Array
@@ -45,7 +45,7 @@ class _ReferenceInputs(msgspec.Struct, frozen=True):
     F_assist: Array
     """Force at the harness (3,), N, world."""
     assist_rate: Array
-    """Its rate (3,), N/s."""
+    """Rate of F_assist (3,), N/s."""
     low: Array
     """Joint limits (12,), rad."""
     high: Array
@@ -54,8 +54,8 @@ class _ReferenceInputs(msgspec.Struct, frozen=True):
 class Reference:
     """The reference pose.
 
-    `solve` and `evaluate` write these arrays, and the next call overwrites them. All but `q` are
-    evaluated at the pose from which the last step went, less than `STEP_SURE` rad from `q`:
+    `solve` and `evaluate` write these arrays, and the next call overwrites them. All except `q` are
+    evaluated at the pose before the last step, less than `STEP_SURE` rad from `q`:
 
     - `q` (12,): q_ref, rad; `v` (12,): v_ref, rad/s.
     - `T` (12, 6): joint rates per unit of p along the closed chain.
@@ -83,7 +83,7 @@ class Reference:
     def load(
         self, pdot_ref: Array, F_O: Array, F_assist: Array, assist_rate: Array, D_left: Array
     ) -> None:
-        """Set what the next `solve` or `evaluate` uses besides the pose.
+        """Set the inputs of the next `solve` or `evaluate` besides the pose.
 
         The arguments are as in `_ReferenceInputs`; `pdot_ref` in m/s and rad/s.
         """
@@ -96,7 +96,7 @@ class Reference:
         """Solve q = IK(p_ref), and evaluate all arrays there: docs/law.md (7).
 
         Args:
-            start: joint angles (12,), rad, from which it begins.
+            start: initial joint angles (12,), rad.
             p_ref: (6,), m and rad.
         """
         inputs = self.inputs
@@ -104,7 +104,7 @@ class Reference:
         for iterations in range(1, STEPS_MAX + 1):
             self._graph()
             largest, beyond = self._check.tolist()
-            if not (0.0 <= largest < STEP_MAX and beyond <= 0.0):  # NaN came to -inf
+            if not (0.0 <= largest < STEP_MAX and beyond <= 0.0):  # mmax makes NaN -inf
                 break
             if largest < STEP_SURE:
                 self.q[:] = self._q_next
@@ -117,9 +117,9 @@ class Reference:
         return result
 
     def expected(self, dt: float) -> Array:
-        """Return where the reference will be in dt, s, if it goes on as it does (12,), rad.
+        """Return the reference extrapolated by dt, s, at its present rate (12,), rad.
 
-        Inside the joint limits, as the solver's own solutions are.
+        It is within the joint limits, as the solver's solutions are.
         """
         start: Array = self.v * dt
         start += self.q
@@ -130,12 +130,12 @@ class Reference:
         return start
 
     def evaluate(self, q: Array) -> None:
-        """Take q (12,), rad, for the reference, and evaluate all arrays there."""
+        """Set the reference to q (12,), rad, and evaluate all arrays there."""
         self.q[:] = self.inputs.q[:] = q
         self._graph()
 
     def kinematics(self) -> Kinematics:
-        """Return the kinematics at the pose of the last evaluation; not for every tick."""
+        """Return the kinematics at the pose of the last evaluation; not meant for every tick."""
         kinematics = self._ik.kinematics
         kinematics.stance[:] = self.inputs.stance
         kinematics.update(self.inputs.q, self.inputs.D_left)

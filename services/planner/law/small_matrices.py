@@ -2,8 +2,8 @@
 
 `np.linalg.solve` of a 12 x 12 system spends more time on types, shapes and error states than on the
 system: 12 us, where Eigen takes 5. Eigenvalues of a 6 x 6 matrix take half of NumPy's time.
-Pinocchio brings these bindings along. SciPy's LAPACK is as fast, but its import is a third of what
-a planner computes before it leads again: 0.37 s.
+Pinocchio brings these bindings along. SciPy's LAPACK is as fast, but its import takes 0.37 s, a
+third of the computing time before a restarted planner leads.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from shared.arrays import Array
 
 
 class LuDecomposition:
-    """P L U of a square matrix: factored once, solved as often as wanted."""
+    """LU decomposition of a square matrix, with pivoting; factored once for many solves."""
 
     __slots__ = ("_lu",)
 
     def __init__(self, A: Array) -> None:
-        """Factor A (n, n), which is not changed. Of a singular one nothing can be solved."""
+        """Factor A (n, n), which stays unchanged. A singular A cannot be solved."""
         self._lu = eigenpy.PartialPivLU(A)
 
     def solve(self, b: Array) -> Array:
@@ -30,14 +30,14 @@ class LuDecomposition:
 
 
 def eigenvalue_min(A: Array) -> float:
-    """Return the smallest eigenvalue of a symmetric A (n, n), all of whose numbers are finite."""
+    """Return the smallest eigenvalue of a symmetric, finite A (n, n)."""
     return float(eigenpy.SelfAdjointEigenSolver(A).eigenvalues()[0])
 
 
 def positive_part(A: Array) -> Array:
     """Return a symmetric A (n, n) with each negative eigenvalue replaced by 0.
 
-    All numbers of A must be finite.
+    All elements of A must be finite.
     """
     solver = eigenpy.SelfAdjointEigenSolver(A)
     values, vectors = solver.eigenvalues(), solver.eigenvectors()

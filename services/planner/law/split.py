@@ -1,13 +1,13 @@
-"""Joint gains of the whole body, and the part of them that the joint services hold alone. Pure.
+"""Joint gains of the whole body, and their local part, which the joint services hold. Pure.
 
 Joint stiffness and damping of the whole body are (paper section III)
 
     K_q = N K_0 + J^T K_p J - sum_i H_i F_i,    B_q = N B_0 + J^T B_p J,    N = I - J^+ J.
 
-The split gives the joint services the part that they hold alone (docs/law.md#gain-split).
-`certified` takes D from the schedule computed offline; `diagonal` is the paper's diag(K_q). In both
-cases the certificate checks the gains. Where D misses the margin, the split stiffens D towards
-certified gains. If no step meets the margin, the source is UNCERTIFIED and the robot must hold.
+The split chooses the local part D (docs/law.md#gain-split). `certified` takes D from the schedule
+computed offline; `diagonal` is the paper's diag(K_q). In both cases the certificate checks the
+gains. If D misses the margin, the split stiffens D towards certified gains. If no step meets the
+margin, the source is UNCERTIFIED and the robot must hold.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ STIFFEN_FRACTIONS: Final = (0.25, 0.5, 0.75, 1.0)
 
 
 class LocalGains(NamedTuple):
-    """Local gains that the joint services hold alone."""
+    """Local gains, on which the joint services hold without the planner."""
 
     D: Array
     """(12,) local stiffness, N m/rad, >= 0."""
@@ -92,7 +92,7 @@ class CouplingGains(NamedTuple):
 
 
 UNCERTIFIED_COUPLING: Final = CouplingGains(4.0, 1.0)
-"""For a robot without a schedule: the paper's split, or averaged legs, for comparison."""
+"""Without a schedule: for the paper's split or averaged legs, which serve for comparison."""
 
 
 class ScheduledGains:
@@ -123,7 +123,7 @@ def _interval(nodes: tuple[float, ...], value: float) -> tuple[int, float]:
 
 
 class GainSplit:
-    """Chooses D and D_B and certifies them."""
+    """Choice of D and D_B, with their certificate."""
 
     def __init__(self, config: RobotConfig) -> None:
         """Load the schedule, the limits and the stiff gains to fall back on.
@@ -165,7 +165,7 @@ class GainSplit:
             z: COM height, m.
             pitch: of the torso, rad.
             T: joint rates per unit of p along the closed chain (12, 6).
-            hessian_O: as for `Certificate.at`.
+            hessian_O: as in `Certificate.at`.
         """
         certificate = self.certificate
         certificate.at(T, hessian_O)
@@ -185,9 +185,9 @@ class GainSplit:
         return LocalGains(D, D_B, margins, source)
 
     def certify(self, D: Array) -> LocalGains:
-        """Return somebody's own D with its margins at the pose of the last `split`.
+        """Return the gains of a controller's own D, with margins at the pose of the last `split`.
 
-        Its source is UNCERTIFIED if it misses them, or is negative or beyond the limits.
+        The source is UNCERTIFIED if D misses the margins, is negative or exceeds its limit.
         """
         D_B = self._schedule.D_B if self._schedule is not None else np.zeros(N_JOINTS)
         margins = self.certificate.margins(D)

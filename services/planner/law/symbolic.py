@@ -1,9 +1,9 @@
-"""Builds the kinematics as expression graphs, once, and evaluates them without Python in between.
+"""Kinematics as expression graphs, built once and evaluated without Python in between.
 
 The CasADi graphs hold the equations of docs/law.md#load-sharing. Both legs are products of
-exponentials, and the load-sharing matrices D mix the torso from them. p, its Jacobian and the
-Hessian term of K_q follow. In NumPy, calls on 3-vectors cost more than their arithmetic. A planner
-tick took 0.5 ms alone, and 1.5 ms among the fleet's other processes on two cores.
+exponentials, and the load-sharing matrices D mix the torso's pose from them. p, its Jacobian and
+the Hessian term of K_q follow. In NumPy, calls on 3-vectors cost more than their arithmetic: a
+planner tick took 0.5 ms alone, and 1.5 ms beside the fleet's other processes on two cores.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Graphs(NamedTuple):
     stance: ca.Function
     """q -> stance (6,) in which the legs agree: position of the right foot relative to the left."""
     measured: ca.Function
-    """(q, v, stance) -> D_L, p, closure, J, C, J_harness, pdot, and of each leg the row (2, 6) that
-    gives its upward force from its torques, and its Jacobian's determinant (2,), m^3."""
+    """(q, v, stance) -> D_L, p, closure, J, C, J_harness, pdot; per leg, the row (2, 6) that maps
+    its torques to its upward force, and its Jacobian's determinant (2,), m^3."""
     reference: ca.Function
     """(q, stance, D_L, p_ref, pdot_ref, F_O, F_assist, F_assist rate, lower and upper joint limits)
-    -> what a tick needs at the reference pose (`services.planner.law.reference`)."""
+    -> the law's quantities at the reference pose (`services.planner.law.reference`)."""
 
 
 class _Foot(NamedTuple):
@@ -90,9 +90,9 @@ def build(config: RobotConfig, geometry: tuple[LegGeometry, LegGeometry]) -> Gra
 
 
 def _measured(sharing: ca.Function, pose: ca.Function) -> ca.Function:
-    """Return the graph of what a tick needs at the measured joints.
+    """Return the graph of a tick's kinematics at the measured joints.
 
-    It calls the other graphs: as one flat expression its code would be slow in a cold cache.
+    It calls the other graphs, because code of one flat expression would be slow in a cold cache.
     """
     q, v, stance = ca.MX.sym("q", N_JOINTS), ca.MX.sym("v", N_JOINTS), ca.MX.sym("s", 6)
     D_left = sharing(q, stance)
@@ -124,10 +124,10 @@ def _upward_force() -> ca.Function:
 
 
 def _reference(pose: ca.Function, hessian: ca.Function) -> ca.Function:
-    """Return the graph of what a tick needs at the reference pose.
+    """Return the graph of the law's quantities at the reference pose.
 
-    One Gauss-Newton step, damped as `InverseKinematics.solve_rates`, and with the same
-    decomposition T = [J; C]^-1 [I; 0], which gives v_ref: docs/law.md (8).
+    It makes one Gauss-Newton step, damped as in `InverseKinematics.solve_rates`. The same
+    decomposition solves T = [J; C]^-1 [I; 0], which gives v_ref: docs/law.md (8).
     """
     q, stance, D_left = ca.MX.sym("q", N_JOINTS), ca.MX.sym("s", 6), ca.MX.sym("D_L", 6, 6)
     p_ref, pdot_ref, F_O = ca.MX.sym("p", 6), ca.MX.sym("pdot", 6), ca.MX.sym("F_O", 6)
@@ -154,7 +154,7 @@ def _reference(pose: ca.Function, hessian: ca.Function) -> ca.Function:
 
 
 def _feet(geometry: tuple[LegGeometry, LegGeometry], stance: ca.SX) -> list[_Foot]:
-    """Return both feet in a stance; each takes half of it, so the world is midway between them."""
+    """Return both feet; each moves by half of the stance, so the origin is midway between them."""
     return [
         _Foot(ca.DM(leg.r_foot) + half * stance[:3], _rotation(half * stance[3:]))
         for leg, half in zip(geometry, (0.5, -0.5), strict=True)
@@ -171,13 +171,13 @@ def _chains(geometry: tuple[LegGeometry, LegGeometry], feet: list[_Foot], q: ca.
 def _stance(geometry: tuple[LegGeometry, LegGeometry], q: ca.SX) -> ca.SX:
     """Return the stance in which both legs carry the torso to the same pose.
 
-    With the feet as in the robot file, they carry it to (R_i, x_i). The feet are then rotated by
+    With the feet as in the robot file, leg i carries it to (R_i, x_i). The feet are then rotated by
     +-phi/2 and shifted by +-d/2:
 
         Rot(phi) = R_L R_R^T
         f_R + d/2 + Rot(phi/2) (x_R - f_R) = f_L - d/2 + Rot(-phi/2) (x_L - f_L)
 
-    A rotation beyond a right angle is no stance; the result is then NaN.
+    The result is NaN for a rotation beyond 90 degrees, which is no stance.
     """
     right, left = _chains(geometry, _feet(geometry, ca.SX.zeros(6)), q)
     turn = left.rotation @ right.rotation.T
@@ -226,7 +226,7 @@ class _Pose(NamedTuple):
     E_inverse: ca.SX
     rotation: ca.SX
     arm_com: ca.SX | None
-    """From the torso's origin to its centre of mass, world; None: it is the origin."""
+    """From the torso's origin to its centre of mass, world; None if both coincide."""
 
 
 def _pose(config: RobotConfig, legs: list[_Leg], D_left: ca.SX) -> _Pose:
@@ -306,7 +306,7 @@ def _hessian(
 def _by_rotation(config: RobotConfig, rotation: ca.SX, F: ca.SX, F_harness: ca.SX) -> ca.SX:
     """Return the Hessian (3, 3) of the work of F and F_harness by a small rotation.
 
-    It is that of moment . angles + F_harness . arm, plus the torso's part of the force times its
+    The work is moment . angles + F_harness . arm, plus the torso's share of the force times its
     centre of mass.
     """
     turn = ca.SX.sym("turn", 3)

@@ -1,1 +1,1 @@
-"""What makes the planner hold, ask for stiffer modules or leave the lead to another. Pure."""
+"""Reasons for the planner to hold, stiffen modules or yield to another planner. Pure."""

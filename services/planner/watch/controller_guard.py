@@ -1,12 +1,12 @@
-"""Stands between a controller of somebody's own and the commands: certificate and form. Pure.
+"""Check of a custom controller's actions before they become commands. Pure.
 
-Gains that do not stand alone at this pose are never sent: the tick is UNCERTIFIED, and all hold.
-So it is while the capture point, or the place where HOLD on this action would come to rest, is near
-the edge of the soles: a controller that leads the robot over smoothly breaks no bound of a joint,
-and made it fall.
-A controller that raises, or returns what is no action, is not asked again: all hold until the
-planner is restarted. Steps, references and torques beyond bounds are the joint services' to
-refuse (`services.joint.envelope`).
+Gains that do not stand alone at this pose are never sent: the tick is UNCERTIFIED, and all modules
+hold. They also hold while the capture point, or the pose in which HOLD would settle on this action,
+is near the edge of the soles. A controller that tips the robot over smoothly violates no joint's
+bounds, and made it fall.
+If a controller raises or returns an invalid action, the guard does not call it again: all modules
+hold until the planner restarts. The joint services refuse steps, references and torques beyond
+their bounds (`services.joint.envelope`).
 """
 
 from __future__ import annotations
@@ -28,34 +28,34 @@ from shared.robot.frames import capture_point
 SUPPORT: Final = 0.5
 """Fraction of the soles within which the capture point and the rest in HOLD must be."""
 CALM: Final = 0.6
-"""Fraction of that room within which the capture point must be before it is asked again."""
+"""Fraction of that area within which the capture point must be before the controller resumes."""
 REST_S: Final = 1.0
-"""Time for which all hold, calm, after an objection; it doubles with each, to `WAIT_MAX_S`."""
+"""First hold time after an objection, s, counted while calm; doubles each time to `WAIT_MAX_S`."""
 WAIT_MAX_S: Final = 60.0
 FORGET_S: Final = 25.0
-"""Led for so long without an objection, the time begins at `REST_S` again."""
+"""Time of leading without an objection after which the hold time restarts at `REST_S`, s."""
 _AT_REST: Final = (0.0,) * 6
 WORDS: Final = 200
-"""Longest reason that goes into a status."""
+"""Maximum length of a reason in the status, characters."""
 
 
 class GuardState(msgspec.Struct):
-    """State of `ControllerGuard`; a controller's is its own affair: it is reset first."""
+    """State of `ControllerGuard`, without the controller's own, which `reset` initialises."""
 
     failed: bool = False
-    """It is not asked again."""
+    """The guard does not call the controller again."""
     why: str = ""
-    """Why its action was not used at the last tick; "": it was."""
+    """Reason why the last tick did not use the controller's action, or ""."""
     rest_s: float = 0.0
-    """Time for which all still hold."""
+    """Remaining hold time, s."""
     wait_s: float = 0.0
-    """The newest such time."""
+    """Newest full hold time, s."""
     time_s: float = 0.0
-    """Since it was last reset."""
+    """Time since the controller's last reset, s."""
 
 
 class ControllerGuard:
-    """Asks a controller, and lets through what holds."""
+    """Runs a controller, and passes on the actions that meet every check."""
 
     def __init__(
         self,
@@ -72,10 +72,10 @@ class ControllerGuard:
         """Return the tick's output.
 
         Args:
-            state: of this guard, which changes.
-            seen: at this tick; its `time_s` is set here.
-            leads: the planner leads; else the controller is reset, and the shipped law's output is
-                returned, which starts at the measured pose.
+            state: state of this guard; updated in place.
+            seen: observation of this tick; its `time_s` is set here.
+            leads: the planner leads; otherwise the controller is reset, and the shipped law's
+                output is returned, which starts at the measured pose.
         """
         law = seen.law
         state.time_s = state.time_s + seen.dt if leads else 0.0
@@ -90,7 +90,7 @@ class ControllerGuard:
                 return self._rested(state, seen)
             action = self._controller.step(shown)
             fault = _fault_of(action)
-        except Exception as error:  # noqa: BLE001 - whatever somebody's code brings about
+        except Exception as error:  # noqa: BLE001 - a custom controller may raise anything
             fault = f"raised {type(error).__name__}: {error}"
         if fault:
             state.why, state.failed = f"the controller {fault}"[:WORDS], True
@@ -113,7 +113,7 @@ class ControllerGuard:
         )
 
     def _rested(self, state: GuardState, seen: Observation) -> LawOutput:
-        """Return the shipped law's output; after an objection all hold until it is calm."""
+        """Return the shipped law's output; after an objection all hold until the robot is calm."""
         if state.why:
             x, y = capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope)
             calm = abs(x) <= CALM * self._room[0] and abs(y) <= CALM * self._room[1]
@@ -124,17 +124,19 @@ class ControllerGuard:
         return seen.law
 
     def _objection(self, seen: Observation, action: Action, local: LocalGains) -> str:
-        """Return why an action must not be sent at this pose; "" if it may."""
+        """Return the reason for not sending an action at this pose; "" if it may be sent."""
         if local.source is SplitSource.UNCERTIFIED:
             service, onboard = local.margins
-            return f"the controller's gains do not stand alone: {service:.2f}, {onboard:.2f}"
+            return (
+                f"the controller's gains do not stand alone: margins {service:.2f}, {onboard:.2f}"
+            )
         held = action.D * (action.q_ref - seen.q) + action.tau_ff - seen.law.tau_ff
         moves = self._law.rest_from_here(action.D, held)[:2].tolist()
         x, y, z = seen.p[:3].tolist()
         there = (x + moves[0], y + moves[1], z)
         places = {
             "the capture point": capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope),
-            "the rest in HOLD": capture_point(there, _AT_REST, seen.law.slope),
+            "the rest position in HOLD": capture_point(there, _AT_REST, seen.law.slope),
         }
         for name, (x, y) in places.items():
             if not (abs(x) <= self._room[0] and abs(y) <= self._room[1]):
@@ -143,14 +145,12 @@ class ControllerGuard:
 
 
 def _fault_of(action: object) -> str:
-    """Return what is wrong with what a controller returned; "" if it is an action."""
+    """Return the fault of a controller's result; "" if it is a valid action."""
     if not isinstance(action, Action):
-        return f"returned a {type(action).__name__}; an Action is right"
+        return f"returned a {type(action).__name__}; it must return an Action"
     for name, values in zip(Action._fields, action, strict=True):
         if not isinstance(values, np.ndarray) or values.shape != (N_JOINTS,):
-            return (
-                f"returned {name} of shape {np.shape(values)}; an array of ({N_JOINTS},) is right"
-            )
+            return f"returned {name} of shape {np.shape(values)}; it must have shape ({N_JOINTS},)"
         if values.dtype not in (np.float32, np.float64) or not np.isfinite(values).all():
             return f"returned {name} with a number that is not finite, or not a float"
     return ""
@@ -162,9 +162,9 @@ def _uncertified(law: LawOutput) -> LawOutput:
 
 
 def _frozen(seen: Observation) -> Observation:
-    """Return what a controller may look at; who writes into it raises.
+    """Return a read-only copy of the observation for the controller.
 
-    They are copies: guard, trips and status read the arrays themselves after the controller.
+    Guard, trips and status read the original arrays after the controller has run.
     """
     law = seen.law
     local = law.local._replace(D=_read_only(law.local.D), D_B=_read_only(law.local.D_B))

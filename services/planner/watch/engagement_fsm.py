@@ -1,4 +1,4 @@
-"""Decides who leads, when all six modules track, and which of them stiffen. Pure.
+"""Engagement: who leads, when all six modules track, and which of them stiffen. Pure.
 
 **Engagement** (docs/architecture.md#modes). All six modules track or none does. While one module's
 state is stale, or one module is not in TRACK, every command carries `hold`, so that no leg works
@@ -6,19 +6,19 @@ against the other. Modules report `ready` once commands have been fresh for long
 are ready, the planner engages: it lifts `hold` for all in the same tick, and they have `GRACE_NS`
 to report TRACK. An overload at the harness and gains that do not stand alone also set `hold`.
 
-After a drop-out of any module, a trip, or gains that do not stand alone, the planner waits before
-it re-engages; the wait grows with the number of recent drop-outs. Six links that drop out in turn
-would otherwise make the robot flap between TRACK and HOLD.
+After a dropout of any module, a trip, or gains that do not stand alone, the planner waits before
+it re-engages; the wait grows with the number of recent dropouts. Without the wait, six links that
+drop out in turn would make the robot flap between TRACK and HOLD.
 
-**Two planners** on one bus, by accident: the one that is followed leads on, the other waits. A
-module takes another planner's commands once those of the present one are too old. A second planner
-that sends takes one module after the other, each at the first message that comes late. So a planner
-that sees modules follow another one leads none until that one has ended. It makes itself known by
-commands that every module refuses: `xrl status` and the log then tell of both.
+**Two planners** on one bus, by accident: the one that modules follow keeps leading, the other
+waits. A module accepts another planner's commands once those of its present planner are too old. A
+second planner that sends would therefore take over one module after the other, each at the first
+late message. So a planner that sees modules follow another one leads none until that one has ended.
+It announces itself by commands that every module refuses: `xrl status` and the log then show both.
 
-**Limp legs.** Modules are to stiffen when another one may be limp. Joint services on one host
-detect a limp neighbour without a planner (`services.joint.neighbours`). The planner adds modules on
-other hosts, and a module that restarts and stays DISARMED.
+**Limp legs.** Modules stiffen when another one may be limp. Joint services on one host detect a
+limp neighbour without a planner (`services.joint.neighbours`). The planner adds modules on other
+hosts, and a module that restarts and stays DISARMED.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from shared.joints import N_MODULES
 from shared.robot.hold_rules import SUPPORT_FOR, Dropouts, Support
 
 GRACE_NS = 150_000_000
-"""ns; after `hold` is lifted, modules may take this long to report TRACK."""
+"""Timeout for the modules to report TRACK after `hold` is lifted, ns."""
 WAITS_NS: Final = tuple(round(s * NS_PER_S) for s in (0.0, 0.5, 1.5, 4.0, 10.0, 20.0, 30.0))
-"""ns; shortest time from a drop-out to re-engaging, by the number of counted drop-outs. With these
-and `FORGET_NS`, no network causes more than six drop-outs in a minute. Index 0: no drop-out
+"""ns; minimum time from a dropout to re-engaging, by the number of counted dropouts. With these
+and `FORGET_NS`, no network causes more than six dropouts in a minute. Index 0: no dropout
 is counted."""
 FORGET_NS: Final = 25 * NS_PER_S
-"""ns; a time engaged without a drop-out that removes one from the count. With 20 s, seven drop-outs
-would fit into a minute."""
+"""ns; each time engaged for this long without a dropout removes one from the count. With 20 s,
+seven dropouts would fit into a minute."""
 
 _NOT_TRACKABLE: Final = (Mode.FAULT, Mode.DAMP)
-"""Modes from which no module returns to TRACK, so that waiting is useless."""
+"""Modes from which no module returns to TRACK, so waiting is useless."""
 _DROPPED: Final = (
     PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED, PlannerMode.UNCERTIFIED,
 )  # fmt: skip
-"""Modes after LEADING that count as a drop-out. OVERLOADED, MISLOADED and the stance have a time or
-a band of their own before they end; gains at the edge of their margin have none."""
+"""Modes after LEADING that count as a dropout. OVERLOADED, MISLOADED and MISPLACED have a delay or
+a hysteresis of their own; gains at the edge of their margin do not."""
 
 # Compared in each tick: docs/contributing.md, The control path.
 _TRACK: Final = Mode.TRACK
@@ -64,7 +64,7 @@ class Engagement(msgspec.Struct):
     since_ns: int = 0
     """Time at which the mode was entered."""
     dropouts: Dropouts = msgspec.field(default_factory=Dropouts)
-    """Recent drop-outs of modules; the count is an index of `WAITS_NS`."""
+    """Recent dropouts of modules; the count is an index of `WAITS_NS`."""
 
     def advance(
         self,
@@ -78,11 +78,11 @@ class Engagement(msgspec.Struct):
 
         Args:
             now_ns: the planner's clock.
-            fresh: per module, a state has come within `planner.state_stale_ms`.
+            fresh: per module, a state has arrived within `planner.state_stale_ms`.
             ready: per module, `JointState.ready`.
             modes: per module, `JointState.mode`.
-            inhibit: mode that says why the planner may not engage, such as OVERLOADED; None if it
-                may.
+            inhibit: mode that prevents engaging, such as OVERLOADED; None if the planner may
+                engage.
         """
         next_mode = self._next(now_ns, fresh, ready, modes, inhibit)
         self.dropouts.advance(
@@ -98,7 +98,7 @@ class Engagement(msgspec.Struct):
         return changed
 
     def wait_ns(self, now_ns: int) -> int:
-        """Return the rest of the wait after drop-outs, ns; 0 if the planner may engage."""
+        """Return the remaining wait after dropouts, ns; 0 if the planner may engage."""
         return max(0, self.dropouts.last_ns + WAITS_NS[self.dropouts.count] - now_ns)
 
     def _next(
@@ -125,40 +125,40 @@ class Engagement(msgspec.Struct):
 
     @property
     def hold(self) -> bool:
-        """True if every command is to carry `hold`."""
+        """True if every command carries `hold`."""
         return self.mode is not _LEADING
 
 
 AGAIN_NS: Final = 500 * NS_PER_MS
-"""Age of another planner's newest command from which one that nobody follows may lead: younger, the
-other may only have been held up."""
+"""Age of the rival's newest command, above which a planner without followers may lead. With a
+younger command, the rival may only have been held up."""
 
 
 ANNOUNCE_NS: Final = 200 * NS_PER_MS
-"""Within the window of `xrl status`."""
+"""Period of announcements while yielding; within the window of `xrl status`."""
 
 
 class RivalWatch(msgspec.Struct):
-    """What a planner knows of another one."""
+    """Knowledge about a rival planner."""
 
     yields: bool = False
-    """True while this planner leads no module."""
+    """True while this planner yields to the rival and leads no module."""
     session: int = 0
-    """Session of the other planner; 0 if none was seen."""
+    """Session of the rival; 0 if none was seen."""
     announced_ns: int = 0
-    """When this planner, as it yields, last made itself known."""
+    """Time of this planner's last announcement while yielding."""
 
     def advance(self, own: int, states: Sequence[JointState], age_max_ns: int) -> bool:
         """Advance by one tick.
 
         Args:
-            own: this planner's session; the one below it was its own before.
-            states: of the modules that have sent one lately.
-            age_max_ns: a module with an older command holds.
+            own: this planner's session; its previous session was one lower.
+            states: states of the modules that have sent one lately.
+            age_max_ns: maximum age of a command; with an older one, a module holds.
 
         Returns:
-            True if this planner has to go on in a new session: a module has retired its own for
-            another's, and refuses it for good.
+            True if this planner must continue in a new session, because a module has retired the
+            present one for a rival's and refuses it for good.
         """
         if all(state.session == own for state in states):  # as in nearly every tick
             self.yields = False
@@ -170,7 +170,7 @@ class RivalWatch(msgspec.Struct):
             state.session for state in states if state.session and _is_in_use(state, within_ns)
         )
         own_count = sum(follow.pop(session, 0) for session in mine)
-        # of planners with equally many modules, as after a start at the same time, one goes on
+        # if both have equally many modules, as after a simultaneous start, the lower session leads
         rival, count = min(follow.items(), key=lambda row: (-row[1], row[0]), default=(0, 0))
         self.session = rival or self.session
         self.yields = count > 0 and (count, -rival) > (own_count, -own)
@@ -183,19 +183,19 @@ class RivalWatch(msgspec.Struct):
         )
 
     def announces(self, now_ns: int) -> bool:
-        """Return True if a planner that yields is to make itself known now."""
+        """Return True if an announcement is due while yielding."""
         due = now_ns - self.announced_ns >= ANNOUNCE_NS
         if due:
             self.announced_ns = now_ns
         return due
 
     def describe(self) -> str:
-        """Return what to say while it yields; else nothing."""
+        """Return a message about the rival while yielding; "" otherwise."""
         if not self.yields:
             return ""
         return (
-            f"another planner leads (session {self.session}), and this one waits; end one of them: "
-            "this one goes on when the other has ended"
+            f"another planner leads (session {self.session}); end one of them. This planner "
+            "resumes when the other has ended"
         )
 
 
@@ -204,27 +204,27 @@ def _is_in_use(state: JointState, age_max_ns: int) -> bool:
 
 
 DISARMED_NS: Final = 200 * NS_PER_MS
-"""ns; a module DISARMED for this long is not about to take its drive over."""
+"""ns; a module DISARMED for longer is not about to take over its drive."""
 
 # Compared in each tick, for six modules: docs/contributing.md, The control path.
 _DISARMED, _FAULT, _HOLDING = Mode.DISARMED, Mode.FAULT, DriveStatus.HOLDING
 
 
 class LimpLegWatch(msgspec.Struct):
-    """Times since which each module is DISARMED while its drive does not hold."""
+    """Watch over modules that are DISARMED while their drives do not hold."""
 
     since_ns: tuple[int, ...] = (0,) * N_MODULES
-    """0 if it is not."""
+    """Time since which each module is in that state; 0 if it is not."""
 
     def advance(self, now_ns: int, states: Sequence[JointState]) -> Support:
-        """Return which modules are to stiffen.
+        """Return the modules that must stiffen.
 
-        FAULT counts in any state of the drive: a drive that does not reply may hold, or have no
-        power.
+        FAULT counts in any state of the drive, because a drive that does not reply may hold or have
+        no power.
 
         Args:
             now_ns: the planner's clock.
-            states: the newest of each module, of any age.
+            states: newest state of each module, of any age.
         """
         self.since_ns = tuple(
             (since_ns or now_ns) if _is_down(state) else 0

@@ -1,21 +1,21 @@
-"""Detects from inside that the robot has fallen. Pure.
+"""Detection of a fall from the robot's own measurements. Pure.
 
-All six modules then go limp (`services.joint.setpoint_law`), and a robot that stands would sink to
-the floor. So no sign counts alone: it has fallen once two that agree have done so for `AFTER_NS`.
+After a fall all six modules go limp (`services.joint.setpoint_law`); a false alarm would let a
+standing robot sink to the floor. No sign counts alone: two must agree for `AFTER_NS`.
 
     tilted    by the IMU, the plane of the soles is off gravity by more than `TILT_MAX`
     apart     the two legs disagree about the torso by more than `APART_MAX`: a sole is up
     whirled   by the IMU's gyroscope, that plane turned faster than `WHIRL_MIN` a moment ago
-    turned    the torso is turned on its legs farther than anybody leads it
+    turned    the torso is turned on its legs farther than a person leads it
     tipped    a sole's pressure was at its edge a moment ago, while both bore the robot
     unloaded  the soles bear less than `UNLOADED` of the weight
 
-With an IMU, `tilted` or `apart` is one of the two. Without one, a robot that topples stiffly on
-straight legs shows nothing: figures in docs/hazards.md. On straight legs the joints' torques do not
-tell what the soles bear. `unloaded` then counts only beside `turned` or `apart`.
+With an IMU, `tilted` or `apart` must be one of the two. Without one, a robot that topples stiffly
+on straight legs goes undetected: figures in docs/hazards.md. On straight legs the joint torques do
+not show the load of the soles, so `unloaded` then counts only beside `turned` or `apart`.
 
-It ends when a person has re-armed the modules: one that had let go holds again. The planner then
-begins as a new one does, and leads only a robot whose feet bear its weight.
+The fallen state ends when a person has re-armed the modules: one that had let go holds again. The
+planner then starts like a new one, and leads only a robot whose feet bear its weight.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from shared.robot.trip_table import limits_of
 AFTER_NS: Final = 150 * NS_PER_MS
 """A robot that is caught in time swings back sooner."""
 MOMENT_NS: Final = 500 * NS_PER_MS
-"""From tipping on an edge to the floor it takes 0.5 to 0.8 s."""
+"""From tipping over an edge to the floor, a fall takes 0.5 to 0.8 s."""
 TILT_MAX: Final = 0.5
-"""rad; it stands on 0.12, and hung on a hoist its legs swing by 0.4."""
+"""rad; the robot stands on slopes up to 0.12, and its legs swing by 0.4 on a hoist."""
 WHIRL_MIN: Final = 0.5
 """rad/s"""
 APART_MAX: Final = (0.15, 0.3)
@@ -46,13 +46,13 @@ APART_MAX: Final = (0.15, 0.3)
 ROLL_YAW_MAX: Final = (0.3, 0.5)
 """rad; requests are 0.12 at most."""
 PITCH: Final = (-0.45, 1.6)
-"""rad; led are -0.1 to 1.2."""
+"""rad; a person leads from -0.1 to 1.2."""
 TIPPING: Final = 0.75
-"""Of half the sole; 1 is its edge, but measured torques lag as a sole tips."""
+"""Fraction of half the sole; 1 is the edge, but measured torques lag as a sole tips."""
 BORNE: Final = 0.8
-"""Of the weight: a hoist that lifts the robot tips it over an edge too, but unloads it first."""
+"""Fraction of the weight; a hoist also tips the robot over an edge, but unloads it first."""
 UNLOADED: Final = 0.45
-"""Of the weight."""
+"""Fraction of the weight."""
 
 _DOWN: Final = (Mode.DAMP, Mode.FAULT)
 _STIFF: Final = (Mode.HOLD, Mode.TRACK)
@@ -60,7 +60,7 @@ _SURE: Final = ("tilted", "apart")
 
 
 class Seen(NamedTuple):
-    """What a tick sees of the robot."""
+    """Measurements of one tick."""
 
     pose: Sequence[float]
     """p (6,), m and rad."""
@@ -69,43 +69,43 @@ class Seen(NamedTuple):
     closure: Sequence[float]
     """Left minus right leg's estimate of the torso (6,), m and rad."""
     soles: Pair
-    """What they bear, N; NaN if it is not known."""
+    """Loads of the soles, N; NaN if unknown."""
     tipping: float
     """`services.planner.law.feet.Soles.tipping`."""
     up: Vector3 | None
-    """Unit vector against gravity, torso axes; None: not known."""
+    """Unit vector against gravity, torso axes; None if unknown."""
     turning: Vector3 | None
-    """Angular velocity of the torso, rad/s, torso axes; None: not known."""
+    """Angular velocity of the torso, rad/s, torso axes; None if unknown."""
 
 
 class FallState(msgspec.Struct):
     """State of `FallWatch`."""
 
     since_ns: int = 0
-    """Time since which two signs agree; 0: they do not."""
+    """Time since which two signs agree; 0 if they do not."""
     tipped_ns: int = 0
     """Time at which a sole last tipped."""
     whirled_ns: int = 0
     """Time at which the soles last turned fast."""
     fell_ns: int = 0
-    """Time at which it was found to have fallen; 0: it has not."""
+    """Time at which the fall was detected; 0 if there was no fall."""
     signs: str = ""
-    """What showed that, in words."""
+    """Signs that showed the fall, as text."""
     down: int = 0
-    """Bit i: module i has let go since."""
+    """Bit i: module i has let go since the fall."""
 
     def describe(self) -> str:
-        """Return that it has fallen and what to do, in words; "" if it has not."""
+        """Return a message about the fall and its remedy; "" if there was no fall."""
         if not self.fell_ns:
             return ""
-        return f"it has fallen ({self.signs}): {FALLEN_REMEDY}"
+        return f"the robot has fallen ({self.signs}): {FALLEN_REMEDY}"
 
 
 class FallWatch:
-    """Compares the signs with each other."""
+    """Detector of a fall: two of six signs must agree."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Take the robot's weight; one that never trips, for studies, does not look for falls."""
+        """Set the weight; a robot whose trips are off, for studies, does not detect falls."""
         self._weight = config.total_mass * GRAVITY
         self._looks = math.isfinite(limits_of(config).legs.limit)
 
@@ -113,10 +113,10 @@ class FallWatch:
         """Advance by one tick; return True if a person has just re-armed a robot that had fallen.
 
         Args:
-            s: this watch's state, which changes.
+            s: state of this watch; updated in place.
             now_ns: the planner's clock.
-            modes: of the six modules; if none is stiff there is nothing to let go of.
-            seen: what this tick sees.
+            modes: modes of the six modules; without a stiff one, no fall is detected.
+            seen: measurements of this tick.
         """
         if s.fell_ns:
             return _is_rearmed(s, modes)
@@ -136,7 +136,7 @@ class FallWatch:
         return False
 
     def _signs(self, s: FallState, now_ns: int, seen: Seen, borne: float) -> list[str]:
-        """Return the signs that are there now, `tilted` and `apart` first."""
+        """Return the present signs, `tilted` and `apart` first."""
         signs = []
         _, _, _, roll, pitch, yaw = seen.pose
         if seen.up is not None and max(map(abs, slope_of(seen.up, roll, pitch, yaw))) > TILT_MAX:
@@ -176,7 +176,7 @@ def _is_rearmed(s: FallState, modes: Sequence[int]) -> bool:
 
 
 def _whirl(seen: Seen, turning: Vector3) -> float:
-    """Return how fast the soles' plane turns, rad/s: the torso's rate less that on its legs."""
+    """Return the rate of the soles' plane, rad/s: the torso's rate minus its rate on its legs."""
     roll, pitch, yaw = seen.rates[3:]
     cosine, sine = math.cos(seen.pose[4]), math.sin(seen.pose[4])
     x, y, z = turning  # R = Rz(yaw) Rx(roll) Ry(pitch), with little roll

@@ -1,24 +1,24 @@
-"""Lets a person rest: closes height and pitch of a robot that stands still, crouched. Pure.
+"""Park: close height and pitch of a robot that stands still in a crouch, so a person rests. Pure.
 
-With the height open, a person who rests f on the harness and one who leads down are the same force
-and the same motion; no rule can tell them apart. So a robot that stands still in a working pose is
-parked: height and pitch are closed where they are, and the assist follows what rests on it.
+With the height open, a person who rests f on the harness and one who leads down cause the same
+force and motion; no rule can tell them apart. So a robot that stands still in a working pose is
+parked: the law closes height and pitch where they are, and the assist A follows the rested weight.
 
-    leads    height and pitch are the person's; A only falls
+    leads    the person leads height and pitch; A only falls
     rests    parked:   A' = (rest - A) / FOLLOW_S + LIFTS (h - z)   within 0 and the pose's cap
     away     parked, and nobody touches the harness
 
     rest = min(-f, -f + g (kg - kg_0))
 
-h is the height at which it is closed, z the measured one: friction hides part of a load, and as the
-robot sinks the person's own legs take up another part. The dynamic certificate holds with both
-terms (`tools.lab.design.dynamic_certificate`).
+h is the closed height, z the measured one. Friction hides part of a load, and as the robot sinks
+the person's own legs take up another part. The dynamic certificate includes both terms
+(`tools.lab.design.dynamic_certificate`).
 
-f is the person's upward force, kg the load that the joints say lies beyond the robot file, and kg_0
-that of the first lead: a sensor that drifts looks like a load that is taken off, and becomes no
-assist. Only a net pull up or a moment backwards that lasts gives height and pitch back: weight that
-is taken off looks like a pull against A, and must not open it. A request for assist wins: the robot
-then leads as it does with park off. Upright nothing is closed, so a squat begins as it always does.
+f is the person's upward force, kg the estimated load beyond the robot file, and kg_0 its value at
+the first lead. A drifting sensor looks like a load that was taken off, and becomes no assist. Only
+a lasting net pull up, or a lasting moment backwards, opens height and pitch. Weight that is taken
+off looks like a pull against A, and must not open them. A request for assist wins: the robot then
+leads as with park off. An upright robot is never parked, so a squat starts as usual.
 
 A shorter pull is a bump. A pull along the floor is reported, and changes nothing.
 """
@@ -37,21 +37,21 @@ from shared.config.robot_config import GRAVITY
 from shared.config.sections import AssistConfig, ParkConfig
 
 BENT: Final = -1.25
-"""rad, theta of the straighter knee in a working pose; or the torso is pitched by `PITCHED`."""
+"""rad; theta of the straighter knee in a working pose. The other criterion is `PITCHED`."""
 PITCHED: Final = 0.3
 CAP: Final = (-0.4, -1.4)
-"""rad, the straighter knee's theta from which on the assist may follow, and with which wholly."""
+"""rad; theta of the straighter knee at which the cap on the assist is zero, and is full."""
 FOLLOW_S: Final = 0.2
 """s; an ordinary shift of weight takes four times as long."""
 LIFTS: Final = 10_000.0
-"""N/s of assist per metre below the closed height; with half as much again, `FOLLOW_S` of 0.3 s and
+"""N/s of assist per metre below the closed height; at 1.5 times this, with `FOLLOW_S` of 0.3 s and
 twice the feedback, a motion grows."""
 SHED_RATE: Final = 400.0
-"""N/s with which the assist falls at most: a person gets up from 150 N within half a second."""
+"""N/s; maximum rate at which the assist falls. A person gets up from 150 N within half a second."""
 LASTS_NS: Final = 50 * NS_PER_MS
-"""A force that opens must last so long: the shortest bump of a person is shorter."""
+"""Minimum duration of a force that opens; the shortest bump of a person is shorter."""
 BUMPED_NS: Final = 300 * NS_PER_MS
-"""How long a bump is reported."""
+"""Time for which a bump is reported."""
 AWAY: Final = (3.0, 1.0)
 """N and N m; any hand on the harness is stronger."""
 AWAY_NS: Final = NS_PER_S // 2
@@ -67,13 +67,13 @@ class ParkState(msgspec.Struct):
     assist: float = 0.0
     """A, N, before the limit of its rate."""
     still_ns: int = 0
-    """Time since which the robot has been still in a working pose; 0: it is not."""
+    """Time since which the robot has been still in a working pose; 0 if it is not."""
     away_ns: int = 0
-    """Time since which nobody has touched it."""
+    """Time since which the robot has been untouched; 0 while somebody touches it."""
     opens_ns: int = 0
-    """Time since which a force has been opening it."""
+    """Time since which a force has acted to open height and pitch; 0 without such a force."""
     pull_ns: int = 0
-    """Time since which somebody has pulled along the floor."""
+    """Time since which somebody has pulled along the floor; 0 without a pull."""
     bumped_ns: int = 0
     """Time of the last bump."""
 
@@ -82,8 +82,8 @@ class ParkState(msgspec.Struct):
         """True if height and pitch are closed."""
         return self.wearing is not Wearing.LEADS
 
-    def shown(self, now_ns: int) -> Wearing:
-        """Return what is reported: a pull and a bump come before the rest."""
+    def reported(self, now_ns: int) -> Wearing:
+        """Return the state to report; a pull and then a bump take precedence."""
         if self.pull_ns and now_ns - self.pull_ns >= PULL_NS:
             return Wearing.PULLS
         if self.bumped_ns and now_ns - self.bumped_ns < BUMPED_NS:
@@ -92,7 +92,7 @@ class ParkState(msgspec.Struct):
 
 
 class Touch(NamedTuple):
-    """What the person does to the robot, and how it stands, in one tick."""
+    """Person's forces on the robot, and the robot's pose, in one tick."""
 
     lifted: float
     """f, N, up."""
@@ -101,18 +101,18 @@ class Touch(NamedTuple):
     level: Pair
     """Force along the torso's x and y, N."""
     pose: Vector3
-    """Theta of the straighter knee, pitch of the torso, rad; and kg - kg_0."""
+    """Theta of the straighter knee and pitch of the torso, rad; and kg - kg_0."""
     rates: Pair
-    """Of the COM's height, m/s, and of the pitch, rad/s."""
+    """Rates of the COM's height, m/s, and of the pitch, rad/s."""
     sinks: float
-    """By how much the COM is below where it is closed, m."""
+    """Distance of the COM below its closed height, m."""
 
 
 class ParkLaw:
-    """Decides when the robot is parked, and what it carries then."""
+    """Decision on parking, and the assist of a parked robot."""
 
     def __init__(self, park: ParkConfig, assist: AssistConfig) -> None:
-        """Take thresholds and the largest assist."""
+        """Set the thresholds and the maximum assist."""
         self.enabled = park.enabled
         self._open, self._open_back = park.open_n, park.open_back_nm
         self._still_ns = round(park.still_s * NS_PER_S)
@@ -121,15 +121,15 @@ class ParkLaw:
     def advance(
         self, s: ParkState, now_ns: int, touch: Touch | None, park: int, dt: float, *, may: bool
     ) -> float:
-        """Advance by one tick; return the assist that is wanted, N.
+        """Advance by one tick; return the requested assist, N.
 
         Args:
-            s: state, which changes.
+            s: state of the park law; updated in place.
             now_ns: the planner's clock.
-            touch: what the person does; None if it is not known, which changes nothing.
-            park: `Park` that is requested.
+            touch: forces and pose of this tick; None if unknown, which keeps the assist.
+            park: requested `Park`.
             dt: time since the last tick, s.
-            may: the planner leads, nobody requests assist, and height and pitch are the person's.
+            may: the planner leads, nobody requests assist, and the person leads height and pitch.
         """
         if touch is None:
             s.opens_ns = s.still_ns = s.away_ns = s.pull_ns = 0

@@ -1,18 +1,18 @@
-"""Decides which measurements are believed. Pure.
+"""Plausibility of measurements, and trust in the harness. Pure.
 
 `Plausible` refuses measurements that no sensor can have made.
 
-`HarnessTrust` decides by the joints' torques whether the harness's wrench is believed. What the
-joints hold up beyond the robot file and the wrench counts as load (`services.planner.law.load`). A
-load hardly ever changes while a person wears the robot, but a sensor can begin to lie: a cell
-drifts, sticks or changes its sign. Since the planner first led, the load must therefore stay within
-`CHANGE_MAX`. In 40 drawn leads it changed by 1.0 kg and 2.3 N m at most, with persons who differ
-from their assist by 24 N.
+`HarnessTrust` checks the harness's wrench against the joint torques. The weight that the joints
+support beyond the robot file and the wrench counts as load (`services.planner.law.load`). A load
+hardly ever changes while a person wears the robot, but a sensor can fail: a cell drifts, sticks or
+changes sign. From the first lead on, the load must therefore stay within `CHANGE_MAX` of its first
+value. In 40 drawn leads it changed by at most 1.0 kg and 2.3 N m, with persons who differ from
+their assist by 24 N.
 
-A wrench that is not believed is used for nothing: no load is learnt from it, the lead is not eased,
-and the assist, which nobody can check then, fades within `EASE_S`. A new zero (`xrl drive tare`)
-or a new start of the planner ends this. A load that was really put on the robot meanwhile looks the
-same; the text says so.
+The planner ignores a distrusted wrench: it learns no load from it and does not ease the lead. The
+assist can no longer be checked, so it fades within `EASE_S`. A new zero (`xrl drive tare`) or a
+restart of the planner ends this. A load that somebody really added looks the same, and the text
+says so.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ SPEED_MAX: Final = 100.0
 TURN_MAX: Final = 100.0
 """rad/s, three times the range of the IMU in `docs/bring-up.md`; faster than any torso turns."""
 UNIT_ERROR: Final = 0.1
-"""How far a direction's length may be from 1."""
+"""Maximum deviation of a direction's length from 1."""
 N_CELLS: Final = 6
 
 
 class Plausible:
     """Bounds of each module's angles and speeds, of the wrench and of the attitude.
 
-    The planner drops what lies beyond them as if it had not come: the sensor goes stale. A single
-    angle or force of 1e300 would stay in the law's filters forever.
+    The planner drops a measurement beyond them, so the sensor goes stale. A single angle or force
+    of 1e300 would stay in the law's filters forever.
     """
 
     def __init__(self, config: RobotConfig) -> None:
@@ -72,7 +72,7 @@ class Plausible:
         )
 
     def is_attitude(self, attitude: Attitude) -> bool:
-        """Return True if up is a direction, and the torso can turn so fast."""
+        """Return True if up is a unit vector and the rate is within `TURN_MAX`."""
         length = math.hypot(*attitude.up)
         return (
             (not attitude.valid or abs(length - 1.0) <= UNIT_ERROR)
@@ -82,36 +82,36 @@ class Plausible:
 
 
 CHANGE_MAX: Final = (3.0, 7.0)
-"""kg and N m."""
+"""Maximum change of the load, kg and N m."""
 AFTER_S: Final = 0.5
 """Time after which such a change counts, s: a robot that trips and holds swings for a moment."""
 EASE_S: Final = 10.0
-"""Time in which all of the assist goes, and comes back, s: 20 N/s of the full one."""
+"""Time in which the whole assist fades out or in, s: 20 N/s for the full one."""
 
 
 class HarnessTrust(msgspec.Struct):
-    """Compares the load with that of the first lead."""
+    """Comparison of the load with that of the first lead."""
 
     load: Vector3 = (0.0, 0.0, 0.0)
     """kg, a and b (N m) of the load when the planner first led."""
     has_led: bool = False
     beyond_s: float = 0.0
-    """Time for which the load has differed from that."""
+    """Time for which the load has differed from that one, s."""
     change: Vector3 = (0.0, 0.0, 0.0)
-    """The same, by which it had changed when the wrench was no longer believed."""
+    """Change of the load when the wrench was first distrusted; units as in `load`."""
     doubted: bool = False
     scale: float = 1.0
-    """Fraction of the requested assist that is left."""
+    """Fraction of the requested assist that remains."""
 
     def advance(self, load: LoadState, tare: int, dt: float, *, leads: bool) -> float:
-        """Advance by one tick; return the fraction of the requested assist that is left.
+        """Advance by one tick; return the fraction of the requested assist that remains.
 
         Args:
-            load: as estimated; put back to that of the first lead when the wrench is no longer
-                believed.
+            load: estimated load; reset to that of the first lead when the wrench is first
+                distrusted.
             tare: `Tare` of the newest wrench.
             dt: time since the last tick, s.
-            leads: the planner is engaged.
+            leads: True while the planner is engaged.
         """
         if tare != Tare.DONE:
             self.doubted = self.has_led = False
@@ -131,13 +131,13 @@ class HarnessTrust(msgspec.Struct):
         return self.scale
 
     def describe(self) -> str:
-        """Return that the wrench is not believed, and what to do, in words; "" if it is."""
+        """Return a message that the wrench is distrusted, with the remedy; "" if it is trusted."""
         if not self.doubted:
             return ""
         kg, a, b = self.change
         moment = max(a, b, key=abs)
         return (
-            f"harness and joints disagree by {kg:+.1f} kg and {moment:+.0f} N m since it was led: "
-            "the assist goes; take all weight off the harness, then `xrl drive tare`. If its load "
-            "has changed, `xrl kill planner`"
+            f"harness and joints disagree by {kg:+.1f} kg and {moment:+.0f} N m since the "
+            "robot was led: the assist ramps down. Take all weight off the harness, then run "
+            "`xrl drive tare`. If the robot's load has changed, run `xrl kill planner`"
         )

@@ -1,26 +1,26 @@
-"""What the planner does before a motor is too warm or a battery is empty. Pure.
+"""Actions before a motor overheats or a battery is empty. Pure.
 
-**Heat** (docs/law.md#heat). Each joint service says how many seconds are left at its present load.
-By the least of them:
+**Heat** (docs/law.md#heat). Each joint service reports the seconds left at its present load. The
+least of them decides:
 
-    below heat.ease_s     the person is told, and the assist goes, as far as nobody rests on it
-    below heat.stand_s    height and pitch are the planner's: it stands up slowly, to nearly
-                          straight knees, where a held pose costs least
-    straight              it stays so for `REST_S`, until `RELEASE` times ease_s are left, and while
-                          a hand presses or pulls it: given back, it would follow that at once
+    below heat.ease_s     warn the wearer, and ramp the assist down to the weight that the wearer
+                          rests on the robot
+    below heat.stand_s    close height and pitch, and stand up slowly to nearly straight knees,
+                          where holding a pose costs least
+    straight              stay straight for at least `REST_S`, until `RELEASE` times ease_s are
+                          left, and while a hand presses or pulls: an open height would follow it
 
-Without a planner the modules hold, and only say it.
+Without a planner the modules hold, and only report the heat.
 
-**Supply.** A battery that runs low is told early:
+**Supply.** The planner warns early of a low battery:
 
-    low      below `supply.low_v`: the person is told, with the number
-    sits     below `supply.sit_v`: the robot goes down by itself
-             (`services.planner.law.closed_reference`)
+    low      below `supply.low_v`: warn the wearer, with the voltage
+    sits     below `supply.sit_v`: lower the robot (`services.planner.law.closed_reference`)
 
 A supply without power makes its modules limp, and the robot falls: from its lowest pose as hard as
-from a stand. Down, a stand can be put under the torso; that is what the time is for. The lowest
-of the six counts, low-passed: a step of the load is no empty battery. Both last until the supply is
-`RECOVERED_V` above their level, because a battery recovers as soon as its load is less.
+from a stand. The early lowering leaves time to put a stand under the torso. The lowest of the six
+supplies counts, low-passed, because a step of the load is not an empty battery. Both states last
+until the supply is `RECOVERED_V` above their level, because a battery recovers once its load falls.
 """
 
 from __future__ import annotations
@@ -38,35 +38,35 @@ from shared.config.sections import HeatConfig, SupplyConfig
 from shared.joints import MODULES, kind_of
 
 EASE_S: Final = 10.0
-"""Time in which all of the assist goes if nobody rests on it: 20 N/s of the full one."""
+"""Time in which the whole assist fades if nobody rests on it, s: 20 N/s for the full one."""
 SHED_RATE: Final = 5.0
-"""N/s with which it goes from under a person who takes weight off."""
+"""Maximum rate at which the assist follows a person who takes weight off, N/s."""
 RESTED_ON: Final = 5.0
-"""N; the assist stays above what the person rests on it, less this; dry friction hides 6 N."""
+"""N; the assist stays above the weight rested on it minus this. Dry friction hides 6 N."""
 STRAIGHT: Final = -0.4
-"""rad, knees' theta: their soft stop is at -0.2, and a straight knee is singular."""
+"""rad, theta of the knees; their soft stop is at -0.2, and a straight knee is singular."""
 SLACK: Final = 0.15
-"""rad by which a knee bends again before the robot goes on standing up."""
+"""rad by which a knee bends again before the robot resumes standing up."""
 REST_S: Final = 20.0
-"""Shortest time for which it stays straight."""
+"""Minimum time for which the robot stays straight, s."""
 RELEASE: Final = 2.0
-"""Times heat.ease_s that must be left before the height is the person's again."""
+"""Multiple of heat.ease_s that must be left before the height opens again."""
 HAND_MAX: Final = 30.0
-"""N beyond the assist, either way; with more on it the height is not given back. With 150 N on it a
-robot fell from 1.29 to 0.95 m within a second."""
+"""N beyond the assist, either way; a stronger hand keeps the height closed. When it opened under
+150 N, a robot dropped from 1.29 to 0.95 m within a second."""
 ASSIST_AGAIN: Final = 10.0
-"""Times heat.ease_s that must be left before the assist comes back: with less it would come and
-go, for the load is light while it is gone."""
+"""Multiple of heat.ease_s that must be left before the assist returns. With less it would come and
+go, because the load is light without it."""
 _KNEES: Final = tuple(i for i, name in enumerate(MODULES) if kind_of(name) == "knee")
 
 
 class HeatDecision(NamedTuple):
-    """What a tick does against the heat."""
+    """Action of a tick against the heat."""
 
     assist: float
-    """Assist that is requested of the law, N."""
+    """Assist to request from the law, N."""
     toward: Toward
-    """Where it goes by itself."""
+    """Where the robot moves on its own."""
 
 
 class HeatWatchState(msgspec.Struct):
@@ -74,26 +74,26 @@ class HeatWatchState(msgspec.Struct):
 
     action: HeatAction = HeatAction.NONE
     since_ns: int = 0
-    """Since when the action is so."""
+    """Time at which the action started."""
     scale: float = 1.0
-    """Fraction of the requested assist that is left."""
+    """Fraction of the requested assist that remains."""
     rests: float = 0.0
-    """What the person rests on the robot, N; it falls by `SHED_RATE` at the most."""
+    """Weight that the person rests on the robot, N; falls at most at `SHED_RATE`."""
     left_s: float = -1.0
-    """Least of all modules; -1: none says."""
+    """Least time of all modules, s; -1 if no module reports one."""
     lifted: float | None = None
-    """Upward force of the person on the robot in the last tick, N; None: not known."""
+    """Upward force of the person on the robot in the last tick, N; None if unknown."""
     hottest: int = 0
-    """Its module; while it rests, the one for which it stood up."""
+    """Module of `left_s`; while the robot stays straight, the one for which it stood up."""
 
     @property
     def moves(self) -> bool:
-        """True while height and pitch are the planner's."""
+        """True while height and pitch are closed for heat."""
         return self.action >= HeatAction.STANDS_UP
 
 
 class HeatWatch:
-    """Decides what is done against the heat."""
+    """Decision on the action against the heat."""
 
     def __init__(self, config: HeatConfig) -> None:
         self._ease_s, self._stand_s = config.ease_s, config.stand_s
@@ -109,9 +109,9 @@ class HeatWatch:
         """Advance by one tick.
 
         Args:
-            s: this watch's state, which changes.
+            s: state of this watch; updated in place.
             now_ns: the planner's clock.
-            states: newest of each module.
+            states: newest state of each module.
             requested: assist that the operator requests, N.
             dt: time since the last tick, s.
         """
@@ -135,17 +135,19 @@ class HeatWatch:
         return HeatDecision(_assist_left(s, requested), toward)
 
     def describe(self, s: HeatWatchState) -> str:
-        """Return what is done against the heat, in words; "" if nothing."""
+        """Return a message about the action against the heat; "" without an action."""
         if s.action is HeatAction.NONE:
             return ""
         name = MODULES[s.hottest]
         if s.action is HeatAction.RESTS and s.left_s < self._ease_s:
-            return f"{name} is hot, {s.left_s:.0f} s left even straight: take load off, or hang it"
+            return (
+                f"{name} is hot, {s.left_s:.0f} s left even if straight: reduce the load or hang it"
+            )
         if s.action is HeatAction.RESTS:
-            return f"{name} was hot: it stays straight until it has cooled, and no hand presses it"
-        words = "stand up, or take weight off; the assist goes"
+            return f"{name} was hot: it stays straight until it is cool and no hand presses it"
+        words = "stand up, or take weight off; the assist ramps down"
         if s.action is HeatAction.STANDS_UP:
-            words = "it stands up by itself; let it"
+            words = "the robot stands up on its own; let it"
         return f"{name} is hot, {s.left_s:.0f} s left at this load: {words}"
 
     def _next(
@@ -166,7 +168,7 @@ class HeatWatch:
 
 
 def _assist_left(s: HeatWatchState, requested: float) -> float:
-    """Return what is left of the requested assist, N."""
+    """Return the remaining part of the requested assist, N."""
     if s.scale >= 1.0:
         return requested
     return min(requested, max(s.scale * requested, s.rests - RESTED_ON))
@@ -181,29 +183,29 @@ class SupplyState(msgspec.Struct):
     """State of `SupplyWatch`."""
 
     volts: float = 0.0
-    """Lowest supply, low-passed, V; 0: none is known."""
+    """Lowest supply, low-passed, V; 0 if unknown."""
     module: str = ""
-    """Whose it is."""
+    """Module of the lowest supply."""
     was_well: bool = False
-    """It was above `supply.low_v`. One that never was is another battery than the file says, and
-    moves nothing."""
+    """True once the supply was above `supply.low_v`. A battery that never was is not the one in the
+    robot file, and moves nothing."""
     low: bool = False
     sits: bool = False
 
 
 class SupplyWatch:
-    """Compares the lowest supply with its levels."""
+    """Comparison of the lowest supply with its levels."""
 
     def __init__(self, config: SupplyConfig) -> None:
-        """Take the levels, V; 0: never."""
+        """Set the levels, V; 0 disables a level."""
         self._low_v, self._sit_v = config.low_v, config.sit_v
 
     def advance(self, s: SupplyState, states: Sequence[JointState], dt: float) -> None:
         """Advance by one tick.
 
         Args:
-            s: this watch's state, which changes.
-            states: the newest of each module.
+            s: state of this watch; updated in place.
+            states: newest state of each module.
             dt: time since the last tick, s.
         """
         known = [(state.supply_v, at) for at, state in enumerate(states) if state.supply_v > 0.0]
@@ -217,15 +219,15 @@ class SupplyWatch:
         s.sits = s.was_well and s.volts < self._sit_v + (RECOVERED_V if s.sits else 0.0)
 
     def describe(self, s: SupplyState) -> str:
-        """Return what the person must know; "" if the supplies are well."""
+        """Return a warning for the wearer; "" if the supplies are well."""
         if s.sits:
             return (
-                f"the supply of {s.module} is at {s.volts:.1f} V, below {self._sit_v:g} V: it goes "
-                "down; hang it, or put a stand under its torso, now"
+                f"the supply of {s.module} is at {s.volts:.1f} V, below {self._sit_v:g} V: the "
+                "robot goes down; hang it, or put a stand under its torso, now"
             )
         if s.low:
             return (
                 f"the supply of {s.module} is at {s.volts:.1f} V, below {self._low_v:g} V: change "
-                f"the battery; at {self._sit_v:g} V it goes down by itself"
+                f"the battery; at {self._sit_v:g} V the robot goes down on its own"
             )
         return ""

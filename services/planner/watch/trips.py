@@ -1,32 +1,32 @@
 """The planner's trips. Pure.
 
-A trip makes all six modules hold. No single joint service can see these faults
+A trip makes all six modules hold. No single joint service can detect these faults
 (`shared.robot.trip_table`; limits: [trips] of the robot file):
 
     legs       the two legs' estimates of the torso's position differ: a sole tips, or a zero is off
     reach      the inverse kinematics does not reach the reference pose
     tracking   a joint is far from its reference
-    unloaded   a sole bears hardly anything (`services.planner.law.feet.Soles`)
+    unloaded   a sole bears almost no load (`services.planner.law.feet.Soles`)
     sinking    the COM moves faster than a person leads
     turning    the torso turns faster than a person leads
     harness    the force on the person differs from the request by too much
     sagging    the person presses the robot down harder than a lead does: power of the load beyond
                assist and lead, while it sinks
-    unattended the robot drifts with nobody's hand on it (`services.planner.watch.unattended`)
+    unattended the robot drifts without a hand on it (`services.planner.watch.unattended`)
     edge       a sole's centre of pressure is near its edge (`services.planner.law.feet.Soles`)
-    tipping    it is at its edge: a shove of 110 N for 0.3 s, on the way into the crawl, had tipped
-               the sole before `edge` counted
-    balance    the COM is ahead of or behind where it is held: references that drift take it there,
-               each as its rate says, so that no joint service sees what is wrong
+    tipping    the same at the edge, with a shorter delay: a shove of 110 N for 0.3 s, on the way
+               into the crawl, tipped the sole before `edge` counted
+    balance    the COM is ahead of or behind its reference. References that drift consistently with
+               their rates can take it there, and no joint service can detect that
 
-The trips are checked while the planner is engaged. `unloaded` counts only once both legs have
-carried the torso, because on the hoist neither does. `sagging` counts only after the person has
-once not pressed, because a hand held up in HOLD first catches up. `balance` counts only while the
-planner leads, which brings back a COM that HOLD left off its place, and then only what is worse
-than that. A trip ends when every value has been within its limit for `CALM_NS` and the value that
-tripped was known all the while: a harness that falls silent does not end a trip on its force. It
-counts as a drop-out (`services.planner.watch.engagement_fsm`): after repeated trips the planner
-re-engages after ever longer waits.
+The planner checks the trips while it is engaged. `unloaded` counts only once both legs have carried
+the torso, because on a hoist neither does. `sagging` counts only once the person has stopped
+pressing, because a hand held up in HOLD first catches up. HOLD may leave the COM off its reference,
+and the leading planner brings it back, so `balance` counts only an offset that grows by `ROOM`.
+A trip ends when every value has been within its limit for `CALM_NS` and the tripped value was known
+throughout: a silent harness does not end a trip on its force. A trip counts as a dropout
+(`services.planner.watch.engagement_fsm`): after repeated trips the planner waits ever longer before
+it re-engages.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ LEADING_LOAD: Final = 40.0
 ASSUMED_SINK_RATE: Final = 1.0
 """m/s; rate at which a load beyond that would sink if the planner engaged again."""
 SINK_RATE_MIN: Final = 1e-3
-"""m/s; least sink rate used for a robot that does not sink."""
+"""m/s; minimum sink rate, used for a robot that does not sink."""
 ROOM: Final = 0.02
-"""m; a COM beyond the limit trips once it is farther off by this than at its least while led."""
+"""m; a COM beyond the limit trips only if its offset is this much above its minimum while led."""
 LOADED_FACTOR: Final = 3.0
-"""Multiple of the `unloaded` limit. A robot whose two legs both carry this much stands."""
+"""Multiple of the `unloaded` limit; a robot stands if both legs carry this load."""
 
 _TRIPS: Final = tuple(PLANNER_TRIPS)
 _UNLOADED: Final = _TRIPS.index(Trip.UNLOADED)
@@ -72,17 +72,17 @@ class TripsState(msgspec.Struct):
     tripped: Trip = Trip.NONE
     """Active trip, which prevents the planner from engaging."""
     why: str = ""
-    """The same as text: value and limit at the time of the trip."""
+    """Text of the trip, with value and limit at its time."""
     stands: bool = False
     """Both legs have carried the torso since the planner engaged."""
     light: bool = False
     """The person has stopped pressing on the robot since the planner engaged."""
     off: float = -1.0
-    """How far off its COM was at the least since the planner engaged, m; -1: it does not lead."""
+    """Minimum offset of the COM since the planner engaged, m; -1 while it does not lead."""
 
 
 class PlannerTrips:
-    """Checks the trips in each tick."""
+    """Check of the trips in each tick."""
 
     def __init__(self, config: RobotConfig) -> None:
         limits = limits_of(config)
@@ -97,10 +97,10 @@ class PlannerTrips:
         """Advance by one tick.
 
         Args:
-            state: of these trips, which changes.
+            state: state of these trips; updated in place.
             now_ns: the planner's clock.
-            values: values that `values_of` measured; NaN is not known, and never trips.
-            leads: the planner is engaged: it trips only then.
+            values: result of `values_of`; NaN is unknown and never trips.
+            leads: True while the planner is engaged; only then it trips.
         """
         loaded = values[_UNLOADED] > LOADED_FACTOR * self._limits[_UNLOADED]
         state.stands = (leads or state.tripped > 0) and (state.stands or loaded)
@@ -150,15 +150,15 @@ def values_of(
     """Return the values to check, in the order of `PLANNER_TRIPS`.
 
     Args:
-        output: of the law.
+        output: output of the law.
         q: measured joint angles (12,), rad.
-        soles: what the right and the left one bear, N.
-        edge: how far out a sole's pressure is (`services.planner.law.feet.Soles.edge`).
-        lifted: upward force of the person on the robot, N, world; None if it is not known.
+        soles: loads of the right and the left sole, N.
+        edge: lateral offset of a sole's pressure (`services.planner.law.feet.Soles.edge`).
+        lifted: upward force of the person on the robot, N, world; None if unknown.
         harness_rate: vertical rate of the harness point, m/s, world.
-        drift: with nobody's hand on the robot, m.
-        leads: the planner is engaged.
-        moves: height and pitch are the planner's, for heat: nothing sags and nothing drifts.
+        drift: drift without a hand on the robot, m.
+        leads: True while the planner is engaged.
+        moves: True while height and pitch are closed for heat, so sagging and drift are 0.
     """
     x, y, z = output.closure[:3].tolist()
     error = output.q_ref - q
@@ -179,7 +179,7 @@ def values_of(
 
 
 def _assist_error(lifted: float | None, assist: float, *, leads: bool) -> float:
-    """Return the error of the force on the person, N; NaN if it is not known.
+    """Return the error of the force on the person, N; NaN if unknown.
 
     In HOLD the robot does not control the requested force. Only a load beyond it, or an upward
     pull, counts.
@@ -190,10 +190,10 @@ def _assist_error(lifted: float | None, assist: float, *, leads: bool) -> float:
 
 
 def _pressing_power(lifted: float | None, assist: float, rate: float, *, leads: bool) -> float:
-    """Return the power with which the person presses the robot down, W; NaN if it is not known.
+    """Return the power with which the person presses the robot down, W; NaN if unknown.
 
-    It is zero for a load up to that of a lead, and only then. In HOLD nothing sinks: the power is
-    that of the load at `ASSUMED_SINK_RATE`.
+    It is zero exactly for loads up to that of a lead. In HOLD nothing sinks, so the power is that
+    of the load at `ASSUMED_SINK_RATE`.
     """
     if lifted is None:
         return math.nan

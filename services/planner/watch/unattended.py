@@ -1,22 +1,22 @@
-"""Detects that nobody leads height and pitch, and how far they have drifted since. Pure.
+"""Detection of height and pitch that nobody leads, and of their drift. Pure.
 
 Height and pitch are open: only the wearer's hand holds them. Without a hand, an error of the
 feedforward or weight on the harness accelerates the robot: a torso turned by 0.8 rad within a
-second of its release. The weight of a person who rests is no hand. The hand along z is the force
-beyond the assist, and the hand about pitch is the moment alone.
+second of its release. The weight of a resting person does not count as a hand. The hand along z is
+the force beyond the assist; the hand about pitch is the moment alone.
 
-Without a hand, friction brakes a direction, and nothing may drive it. Its rate is therefore
-compared with c, the rate at which the hand left, which falls at least by `COAST_S`:
+Without a hand, friction must brake each direction and nothing may drive it. The watch therefore
+compares the rate with c, the rate at which the hand left. c decays with `COAST_S` or faster:
 
     c        = rate, clamped between 0 and the last c;  c = rate while a hand is felt
     excess'  = rate - c;                           excess = 0 while a hand is felt
     released   if |excess + STOP_S (rate - c)| > RUNAWAY
 
-A released direction is closed (`services.planner.law.closed_reference`) until a hand is back. A
-hand that was there after all, too light to be felt, then feels a resistance and opens it. A pitch
-that stays released for `PROOF_NS` shows that nobody holds the robot: its height is then closed as
-well, and the weight of a person who rests no longer moves it. A hand on the pitch opens both. What
-moves nevertheless is drift, which trips:
+A released direction is closed (`services.planner.law.closed_reference`) until a hand returns. If a
+hand was there after all, too light to be felt, it meets a resistance and opens the direction. A
+pitch that stays released for `PROOF_NS` shows that nobody holds the robot. The height is then
+closed too, so the weight of a resting person no longer moves it. A hand on the pitch opens both.
+Any further motion is drift, which trips:
 
     drift    = max(|z - z0|, ARM |pitch - pitch0|)       z0, pitch0: when the hand was lost
 """
@@ -37,12 +37,12 @@ HAND_MIN: Final = (3.0, 1.0)
 """N and N m; noise and zero errors are smaller, a leading hand is stronger (dry friction alone
 takes 6 N)."""
 TOUCH_MIN: Final = (3.0, 0.25)
-"""N and N m; twice the noise. A hand that guides a torso which the feedforward drives may need less
-than 1 N m for seconds: in 6 of 31 drawn leads."""
+"""N and N m; twice the noise. In 6 of 31 drawn leads, a hand that guided a torso driven by the
+feedforward needed less than 1 N m for seconds."""
 COAST_S: Final = 0.5
-"""s; friction stops a torso of 0.4 rad/s, led and then left, in 0.3 s."""
+"""Time constant, s; friction stops a torso of 0.4 rad/s, led and then left, in 0.3 s."""
 HAND_LOST_NS: Final = NS_PER_S // 2
-"""ns; a hand that brakes the robot's inertia with its friction is not felt for up to 0.3 s."""
+"""ns; while friction helps a hand to brake the robot, the hand is not felt for up to 0.3 s."""
 ARM: Final = 0.25
 """m per rad of the torso's pitch."""
 RUNAWAY: Final = (0.0075, 0.04)
@@ -50,36 +50,36 @@ RUNAWAY: Final = (0.0075, 0.04)
 STOP_S: Final = 0.1
 """s; the closed directions stop a drift of 1 rad/s within 0.1 rad."""
 HAND_BACK: Final = (25.0, 1.0)
-"""N and N m; a stronger hand opens a released direction. A person who rests on the robot asks for
-an assist, and differs from it by 24 N at most."""
+"""N and N m; a stronger hand opens a released direction. A person who rests on the robot requests
+an assist, and differs from it by at most 24 N."""
 HAND_BACK_NS: Final = 50 * NS_PER_MS
 """ns; a bump is shorter."""
 PROOF_NS: Final = 120 * NS_PER_MS
-"""ns; most hands that lead the pitch are felt sooner. In 5 of 60 drawn leads a hand was not, and
-its peak rose by 5 to 32 N."""
+"""ns; most hands that lead the pitch are felt sooner. In 5 of 60 drawn leads the hand was not felt,
+and its peak force rose by 5 to 32 N."""
 
 
 class _OpenDirection(msgspec.Struct):
     """State of one open direction, in m or rad."""
 
     coast: float = 0.0
-    """c, the rate at which the hand left it; 1/s."""
+    """c, the decaying rate at which the hand left, m/s or rad/s."""
     excess: float = 0.0
     drive: float = 0.0
-    """Acceleration that it showed when it was released, m/s^2 or rad/s^2."""
+    """Acceleration at the release, m/s^2 or rad/s^2."""
     released_ns: int = 0
-    """Time since which nobody leads it; 0 if a hand does."""
+    """Time since which the direction has been without a leading hand; 0 while a hand leads it."""
     back_ns: int = 0
-    """Time since which a hand has been back on it; 0 if it is not."""
+    """Time since which a hand has been back; 0 without a hand."""
 
 
 class Unattended(msgspec.Struct):
-    """Pose and rates at which a hand was last felt."""
+    """Watch over height and pitch, with the pose in which a hand was last felt."""
 
     felt_ns: int = 0
     """Time at which a hand was last felt."""
     left: Pair | None = None
-    """Pose in which it left the robot: height of the COM, m, and the torso's pitch, rad."""
+    """Pose in which the hand left the robot: COM height, m, and torso pitch, rad."""
     last_ns: int = 0
     """Time of the last tick."""
     height: _OpenDirection = msgspec.field(default_factory=_OpenDirection)
@@ -87,25 +87,25 @@ class Unattended(msgspec.Struct):
 
     @property
     def released(self) -> Released:
-        """True if nobody leads the height, the pitch."""
+        """(height, pitch), each True while nobody leads it."""
         return self.height.released_ns > 0, self.pitch.released_ns > 0
 
     def describe(self) -> str:
-        """Return that nobody leads, in words; "" if somebody does."""
+        """Return a message that nobody leads; "" if a hand leads."""
         if not any(self.released):
             return ""
-        return "nobody leads it: it stays where it is until a hand moves it"
+        return "nobody leads the robot: it stays where it is until a hand moves it"
 
     def advance(self, now_ns: int, pose: Pair, rates: Pair, hand: Pair, *, leads: bool) -> float:
         """Advance by one tick; return the drift, m.
 
         Args:
             now_ns: the planner's clock.
-            pose: height of the COM, m, and the torso's pitch, rad.
-            rates: of both, m/s and rad/s.
+            pose: COM height, m, and torso pitch, rad.
+            rates: rates of both, m/s and rad/s.
             hand: upward force of the person beyond the assist, N, and moment about pitch, N m; NaN
-                if not known, which counts as a hand.
-            leads: the planner is engaged; otherwise nothing is open, and nothing is released.
+                if unknown, which counts as a hand.
+            leads: True while the planner is engaged; otherwise no direction is open or released.
         """
         dt = (now_ns - self.last_ns) / NS_PER_S if self.last_ns else 0.0
         self.last_ns = now_ns
@@ -130,7 +130,7 @@ class Unattended(msgspec.Struct):
 
 
 def _coast(direction: _OpenDirection, rate: float, dt: float, *, felt: bool) -> None:
-    """Update c, and the way beyond it."""
+    """Update c, and the distance travelled beyond it."""
     if felt:
         direction.coast, direction.excess = rate, 0.0
         return
@@ -140,7 +140,7 @@ def _coast(direction: _OpenDirection, rate: float, dt: float, *, felt: bool) -> 
 
 
 def _is_back(direction: _OpenDirection, now_ns: int, hand: float, least: float) -> bool:
-    """Return True if a hand has been on a direction for `HAND_BACK_NS`, or is not known."""
+    """Return True if a hand has been on a direction for `HAND_BACK_NS`, or is unknown."""
     if abs(hand) < least:
         direction.back_ns = 0
         return False

@@ -1,1 +1,1 @@
-"""The drives' firmware and the motors, twelve axes at a time."""
+"""Emulated firmware and motors of the drives, twelve axes at a time."""

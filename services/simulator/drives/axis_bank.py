@@ -1,10 +1,10 @@
 """Twelve emulated ODrive axes: state machine, watchdogs, checks and errors (docs/drives.md).
 
-Firmware 0.5.6; the traps are kept on purpose: OVERSPEED disarms in torque mode too, a disarmed axis
-floats while its sibling keeps its torque, the watchdog runs in IDLE as well, re-arming does not
-zero `input_torque`, setting a mode moves `input_pos` to the motor, an axis can be in IDLE with
-`axis_error` 0, an axis that reads no encoder stays armed and blind for 51 ms and counts no turns
-made meanwhile, and a restart restores the saved settings.
+Firmware 0.5.6, with its traps. OVERSPEED disarms in torque mode too. A disarmed axis floats while
+its sibling keeps its torque. The watchdog runs in IDLE too. Re-arming does not zero `input_torque`.
+Setting a mode moves `input_pos` to the motor. An axis can be in IDLE with `axis_error` 0. An axis
+that reads no encoder stays armed and blind for 51 ms and misses the turns made meanwhile. A restart
+restores the saved settings.
 
 Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
 Units at the motor: turns, turn/s, N m, A.
@@ -52,9 +52,9 @@ __all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "AxisErrors"]
 Vector = NDArray[np.float64]
 
 REFUSED_S: Final = 1e-3
-"""s for which an axis that has an error, or no phase, is in closed loop without torque."""
+"""s; time in closed loop without torque for an axis with an error or without a phase."""
 REARM_S: Final = 0.25e-3
-"""s for which an armed axis that is asked for closed loop again gives no torque."""
+"""s; gap in the torque of an armed axis when closed loop is requested again."""
 _EARLY_S: Final = 1e-6
 
 
@@ -63,7 +63,7 @@ class AxisBank:
 
     The arrays without an underscore may be read at any time. `input_pos`, `input_vel`,
     `input_torque`, the gains and the limits may also be written between steps; other settings
-    are set by name in `settings`; modes, states and errors change by the methods only.
+    are set by name in `settings`. Only the methods change modes, states and errors.
     """
 
     def __init__(
@@ -79,10 +79,10 @@ class AxisBank:
 
         Args:
             drive: the robot file's `[drive]`.
-            encoder_counts_per_turn: of the encoders themselves.
+            encoder_counts_per_turn: counts per turn of the encoders.
             watchdog: True if the drives' watchdogs run.
             motor_signs: sign of each motor's count and of its zero mark.
-            heat: how motors and output stages warm up; None: the default.
+            heat: thermal model; None for the default.
         """
         self.settings = configured(
             drive, encoder_counts_per_turn=encoder_counts_per_turn, watchdog=watchdog
@@ -117,12 +117,12 @@ class AxisBank:
         self._watchdogs = Watchdogs(self.settings)
         self._spinout = Spinout(self.settings)
         self._requested: dict[int, int] = {}
-        self._refused_s: dict[int, float] = {}  # until when each says that it is in closed loop
+        self._refused_s: dict[int, float] = {}  # end of the reported closed loop
         self._rearmed: set[int] = set()
 
     @property
     def regulates(self) -> bool:
-        """True if any axis has a loop, or calibrates: it wants every step of the world."""
+        """True if any axis regulates or calibrates, and so needs every step of the world."""
         return bool(self.calibration.running) or self._control.regulates()
 
     def step(self, now_s: float, pos_turns: Vector, vel_turns: Vector) -> Vector:
@@ -168,17 +168,17 @@ class AxisBank:
     # ---- requests of a front
 
     def feed(self, *axes: int) -> None:
-        """Feed the watchdogs of axes: any CAN frame to one does."""
+        """Feed the watchdogs of axes, as any CAN frame to one does."""
         for axis in axes:
             self._watchdogs.feed(axis, self.now_s)
 
     def request_state(self, axis: int, state: int) -> None:
-        """Ask for a state: IDLE, CLOSED_LOOP_CONTROL or a calibration; its low byte counts.
+        """Request a state: IDLE, CLOSED_LOOP_CONTROL or a calibration; only its low byte counts.
 
-        Closed loop with any error present, or without the encoder's calibration, is entered for
-        1 ms without torque. Closed loop without the motor's, an encoder's calibration before its
-        motor's, and any other state is INVALID_STATE and leads to IDLE. What an axis is asked for
-        before it runs, it does when it runs.
+        With any error, or without the encoder's calibration, closed loop lasts for 1 ms without
+        torque. Closed loop without the motor's calibration, an encoder's calibration before its
+        motor's, and any other state set INVALID_STATE and lead to IDLE. An axis that does not run
+        yet executes the request once it runs.
         """
         drive, state = axis >> 1, state & 0xFF
         if state == AxisState.UNDEFINED:
@@ -210,7 +210,7 @@ class AxisBank:
     def set_modes(self, axis: int, control_mode: int, input_mode: int) -> None:
         """Set the controller's modes; only PASSTHROUGH is emulated, others are an error.
 
-        Position mode, also where it was on already, sets `input_pos` to where the motor is.
+        Position mode sets `input_pos` to the motor's position, even if it was on already.
         """
         control_mode, input_mode = control_mode & 0xFF, input_mode & 0xFF
         if input_mode != InputMode.PASSTHROUGH or control_mode not in (1, 2, 3):
@@ -228,33 +228,33 @@ class AxisBank:
     def clear_errors(self, axis: int) -> None:
         """Clear all errors of the axis's ODrive: the firmware clears both axes.
 
-        A cause that lasts (heat, the bus) sets its error again at the next step, missing words of
-        an encoder only after 51 ms: their filter is emptied.
+        A lasting cause (heat, the bus) sets its error again at the next step. Missing words of an
+        encoder do so only after 51 ms, because their filter is emptied.
         """
         for each in _both(axis):
             self.faults[each] = AxisErrors()
             self._encoders.clear_errors(each)
 
     def set_error(self, axis: int, register: str, error: int) -> None:
-        """Write an error register by its name in `AxisErrors`: over USB all of them may be written.
+        """Write an error register by its name in `AxisErrors`, as over USB, where all are writable.
 
-        What stands in the axis's own disarms it, as if it had occurred; the filter of an encoder's
-        missing words, and the sibling, are left alone.
+        An error in the axis's own register disarms it, as if it had occurred. The filter of an
+        encoder's missing words, and the sibling, are unchanged.
         """
         self.faults[axis] = self.faults[axis]._replace(**{register: error})
         if self.faults[axis].axis:
             self._disarm(axis)
 
     def estop(self, axis: int) -> None:
-        """Disarm one axis with ESTOP_REQUESTED; its sibling goes on."""
+        """Disarm one axis with ESTOP_REQUESTED; its sibling continues."""
         self._fail(axis, FAULTS["ESTOP"])
 
     def reboot(self, axis: int) -> None:
         """Restart the axis's ODrive.
 
-        Both axes float, inputs are zero, errors gone, settings as saved. It says nothing for
-        `TALKS_S`. From then on it answers, in state 0, and until `BOOT_S` it keeps the last state
-        that it was asked for.
+        Both axes float, inputs are zero, errors are cleared, settings are as saved. The ODrive is
+        silent for `TALKS_S`. From then on it answers, in state 0, and until `BOOT_S` it stores the
+        last requested state.
         """
         drive = axis >> 1
         for each in _both(axis):
@@ -288,24 +288,24 @@ class AxisBank:
             trajectory_done=True,
         )
 
-    # ---- what happens to the drives
+    # ---- faults and supply
 
     def inject(self, axis: str, error: str) -> None:
         """Fault an axis, by its name in `AXIS_NAMES` and the fault's name in `FAULTS`.
 
         Raises:
-            DriveError: there is no such axis or fault.
+            DriveError: the axis or the fault is unknown.
         """
         if axis not in AXIS_NAMES:
-            raise DriveError(f"no axis {axis!r}; there are {', '.join(AXIS_NAMES)}")
+            raise DriveError(f"unknown axis {axis!r}; use one of {', '.join(AXIS_NAMES)}")
         if error not in FAULTS:
-            raise DriveError(f"no fault {error!r} for {axis}; there are {', '.join(FAULTS)}")
+            raise DriveError(f"unknown fault {error!r} for {axis}; use one of {', '.join(FAULTS)}")
         number = AXIS_NAMES.index(axis)
         for each in _both(number) if error in SHARED_FAULTS else (number,):
             self._fail(each, FAULTS[error])
 
     def supply(self, drive: int, volts: float) -> None:
-        """Set the voltage of an ODrive's supply; below `DEAD_VOLTAGE` it is off, later boots."""
+        """Set an ODrive's supply voltage; below `DEAD_VOLTAGE` it is off, above it boots again."""
         self.bus.supply[drive] = volts
         self.bus.changed()
         if volts < DEAD_VOLTAGE:
@@ -344,7 +344,7 @@ class AxisBank:
                 self._fail(axis, FAULTS["OVERSPEED"])
 
     def _end_closed_loops(self) -> None:
-        """End what a closed loop leaves: the state of a refused one, the power of the last."""
+        """End the states of refused closed loops, and check disarmed axes for a spinout."""
         for axis, until_s in list(self._refused_s.items()):
             if until_s <= self.now_s + _EARLY_S:
                 del self._refused_s[axis]
@@ -356,9 +356,9 @@ class AxisBank:
             self._fail(axis, FAULTS["SPINOUT"])
 
     def _at_shafts(self) -> Vector:
-        """Return the torques at the shafts: a blind rotor is driven off phase.
+        """Return the torques at the shafts, where a blind rotor is driven off phase.
 
-        An axis that was armed and is armed again lets go for a quarter of a millisecond.
+        An armed axis that is armed again gives no torque for a quarter of a millisecond.
         """
         self._shaft[:] = self.torque
         self._encoders.commutate(self._shaft)
@@ -375,10 +375,10 @@ class AxisBank:
             self.state[axis] = outcome
 
     def _arm(self, axis: int) -> None:
-        """Enter closed loop; `input_torque` is left as it stands, as the firmware does.
+        """Enter closed loop; as in the firmware, `input_torque` is unchanged.
 
-        Without a phase, or with an error, the state lasts for as long as the firmware's thread
-        sleeps; its target moves to where the motor is all the same.
+        Without a phase, or with an error, the state lasts only while the firmware's thread sleeps.
+        The target still moves to the motor's position.
         """
         if self._control.armed[axis]:
             self._rearmed.add(axis)

@@ -1,14 +1,14 @@
-"""Calibration of the emulated axes: what each has, and how it is found (docs/drives.md).
+"""Calibration of the emulated axes: its state and its procedures (docs/drives.md).
 
 Firmware 0.5.6, `Motor::run_calibration` and `Encoder::run_offset_calibration`. The drive turns a
-field, and the rotor follows it as that of a synchronous motor: with the torque of the current
-times the sine of the electrical angle that it lags by. A shaft that is blocked, or loaded beyond
-that torque, does not follow, and the drive finds that by its encoder's count.
+field, and the rotor follows as in a synchronous motor: the torque is that of the current times the
+sine of the electrical lag. A shaft that is blocked, or loaded beyond that torque, does not follow,
+and the drive detects that by its encoder's count.
 
-Traps that are kept: an encoder's calibration forgets the turns as it begins. A request for IDLE
-in the motor's second part or on the encoder's way back leaves the axis calibrated, by half a
-measurement. Without a current a resistance is NaN, and `save_configuration` keeps it. With an
-error latched nothing is measured, and no error is added.
+Emulated traps: an encoder's calibration forgets the turns when it starts. A request for IDLE in the
+second part of the motor's calibration, or on the encoder's way back, leaves the axis calibrated by
+half a measurement. Without a current a resistance is NaN, and `save_configuration` keeps it. With a
+latched error, nothing is measured and no error is added.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from shared.joints import N_JOINTS
 
 RESISTANCE_S: Final = 3.0
 INDUCTANCE_S: Final = 1.25
-"""Both parts of the motor's calibration."""
+"""Durations of the two parts of the motor's calibration."""
 LOCK_S: Final = 1.0
-"""The encoder's begins so: the field stands, and its current comes up in the first half."""
+"""First part of the encoder's: the field stands still, and its current rises in the first half."""
 RESPONSE_COUNTS: Final = 8
-"""An encoder that counts no more than this on the way out has not answered."""
+"""An encoder that counts at most this on the way out has not responded."""
 VOLTAGE_GAIN: Final = 1.0
-"""V/s per A that the test current lacks, until it is there."""
+"""V/s per A of missing test current."""
 LEAD_S: Final = 0.0015
-"""A world's step holds a torque, and its current loop's lag delays it: by so much, together. The
-field's torque follows the angle at once; late, it would shake the rotor out of step."""
+"""Delay of a torque in the world, by the hold of a step and the current loop's lag. The field's
+torque follows the angle at once; a late torque would shake the rotor out of step."""
 BRAKING: Final = 0.05
-"""Share of a short circuit's that a current loop of 1000 rad/s leaves at a rotor's 30 Hz."""
+"""Fraction of short-circuit braking that a current loop of 1000 rad/s leaves at a rotor's 30 Hz."""
 CURRENT_MARGIN: Final = 8.0
-"""A beyond `current_lim` that disarm, as shipped."""
+"""A beyond `current_lim` at which the drive disarms; the default."""
 
 SEQUENCES: Final = {
     AxisState.FULL_CALIBRATION_SEQUENCE: (
@@ -64,7 +64,7 @@ _NONE: Final = AxisErrors()
 
 
 class _Task(msgspec.Struct):
-    """What an axis is at."""
+    """Running calibration of an axis."""
 
     state: AxisState
     rest: tuple[AxisState, ...]
@@ -76,7 +76,7 @@ class _Task(msgspec.Struct):
     phase: float = 0.0
     """Angle of the field, electrical rad."""
     count: int = 0
-    """The encoder's."""
+    """Count of the encoder."""
     locked_count: int = 0
     total: int = 0
     """Sum of counts over the scan's samples."""
@@ -84,18 +84,18 @@ class _Task(msgspec.Struct):
 
 
 class Calibration:
-    """Which axes are calibrated, and which are at it.
+    """Calibration state of all axes.
 
     Attributes:
         motor: `motor.is_calibrated` of each axis.
         encoder: `encoder.is_ready` of each axis.
-        running: what the axes are at that calibrate now.
-        response: counts of each encoder's last way out; 0: none since the start.
-        resistance: of each motor's phases in truth, ohm; a broken wire has a great one.
+        running: running calibrations, by axis.
+        response: counts of each encoder's last way out; 0 if none since the start.
+        resistance: true phase resistance of each motor, ohm; large for a broken wire.
     """
 
     def __init__(self, settings: Settings, encoders: AxisEncoders, torque_constant: float) -> None:
-        """Start with what is `pre_calibrated`; `torque_constant` is the motors' own, N m/A."""
+        """Start from the `pre_calibrated` settings; `torque_constant` is the motors', N m/A."""
         self._settings, self._encoders = settings, encoders
         self._torque_constant = torque_constant
         self.motor = [False] * N_JOINTS
@@ -114,9 +114,9 @@ class Calibration:
         self.encoder[axis] = self._setting(axis, "encoder.config.pre_calibrated") > 0.0
 
     def take_mark(self, axis: int, name: str) -> None:
-        """Act on a written `pre_calibrated`: a motor believes it, an encoder that is not ready not.
+        """Apply a written `pre_calibrated`: a motor accepts it, an encoder only if it is ready.
 
-        `name` is the setting's, below the axis.
+        `name` is the setting's name below the axis.
         """
         if name == "motor.config.pre_calibrated":
             self.motor[axis] = self.motor[axis] or self._setting(axis, name) > 0.0
@@ -128,15 +128,15 @@ class Calibration:
         return self.motor[axis] and self.encoder[axis]
 
     def refuses(self, axis: int) -> bool:
-        """Return True if closed loop is refused; without an encoder that is ready it ends."""
+        """Return True if closed loop is refused; without a ready encoder it starts and ends."""
         return not self.motor[axis] or self._setting(axis, "encoder.config.direction") == 0.0
 
     def begin(
         self, axis: int, states: tuple[AxisState, ...], now_s: float, *, latched: bool = False
     ) -> AxisState | AxisErrors:
-        """Begin the first of the states; return it, IDLE if there is none, or why not.
+        """Start the first of the states; return it, IDLE without states, or the errors.
 
-        An error that is `latched` disarms the axis in the first cycle.
+        A `latched` error disarms the axis in the first cycle.
         """
         if not states:
             return AxisState.IDLE
@@ -154,7 +154,7 @@ class Calibration:
         return state
 
     def advance(self, axis: int, now_s: float) -> AxisState | AxisErrors:
-        """Go on with what an axis is at; return its state, or why it failed."""
+        """Advance an axis's calibration; return its state, or its errors."""
         task = self.running[axis]
         procedure = self._measure if task.state == _MOTOR else self._scan
         outcome = procedure(axis, task, now_s - task.begun_s)
@@ -164,9 +164,9 @@ class Calibration:
         return self.begin(axis, task.rest, now_s) if outcome == _NONE else outcome
 
     def stop(self, axis: int, *, requested: bool = False) -> AxisErrors:
-        """Break off what an axis is at; return the error that the firmware makes of the half.
+        """Abort an axis's calibration; return the errors that the firmware reports for it.
 
-        It is `requested` by a request for another state; else the axis was disarmed.
+        `requested` is True for a request for another state, False if the axis was disarmed.
         """
         task = self.running.pop(axis, None)
         if task is None:
@@ -191,8 +191,8 @@ class Calibration:
         """Return the torque on the shaft of an axis that calibrates, N m.
 
         The motor's calibration sets voltages, so its windings brake the rotor as if they were
-        short-circuited. The encoder's sets currents, whose loop lets `BRAKING` of that remain.
-        `pos_turns` and `vel_turns`, turn/s, are the rotor's in truth.
+        short-circuited. The encoder's calibration sets currents, whose loop leaves `BRAKING` of
+        that. `pos_turns` and `vel_turns`, turn/s, are the rotor's true position and speed.
         """
         task, constant = self.running[axis], self._torque_constant
         ahead = pos_turns + LEAD_S * vel_turns
@@ -202,10 +202,10 @@ class Calibration:
         braking *= 1.0 if task.state == _MOTOR else BRAKING
         return float(torque - braking * 2.0 * math.pi * vel_turns)
 
-    # ---- procedures: None while they run, then no error, or why they failed
+    # ---- procedures: None while running, then their errors, `_NONE` after success
 
     def _measure(self, axis: int, task: _Task, elapsed_s: float) -> AxisErrors | None:
-        """Drive a standing current up to its set-point, then shake it."""
+        """Raise a standing current to its setpoint, then oscillate it."""
         if task.stage == 0:
             ohm = float(self.resistance[axis])
             asked = self._setting(axis, "motor.config.calibration_current")
@@ -220,7 +220,7 @@ class Calibration:
                 return motor_fault(MotorError.PHASE_RESISTANCE_OUT_OF_RANGE)
             if elapsed_s >= RESISTANCE_S:
                 self._keep_resistance(axis, task)
-                task.stage, task.current = 1, 0.0  # the shaking has no torque
+                task.stage, task.current = 1, 0.0  # the oscillation has no torque
         elif elapsed_s >= RESISTANCE_S + INDUCTANCE_S:
             self._settings.find(axis, "motor.config.phase_inductance", PHASE_INDUCTANCE)
             self.motor[axis] = True
@@ -253,7 +253,7 @@ class Calibration:
         return None
 
     def _judge(self, axis: int, task: _Task) -> AxisErrors:
-        """Judge the way out by the encoder's count, and find its direction."""
+        """Check the way out by the encoder's count, and find the direction."""
         response = task.count - task.locked_count
         if abs(response) <= RESPONSE_COUNTS:
             return encoder_fault(EncoderError.NO_RESPONSE)
@@ -269,19 +269,19 @@ class Calibration:
         return _NONE
 
     def _too_much(self, axis: int, current: float) -> AxisErrors | None:
-        """Return an error if the field's current is beyond what the drive lets flow."""
+        """Return an error if the field's current exceeds the drive's limit."""
         if current <= self._setting(axis, "motor.config.current_lim") + CURRENT_MARGIN:
             return None
         return motor_fault(MotorError.CURRENT_LIMIT_VIOLATION)
 
     def _keep_resistance(self, axis: int, task: _Task) -> None:
-        """Keep the voltage there is now over the current that was asked for, there or not."""
+        """Store the present voltage over the requested current, even if that is not reached."""
         volts = float(self.resistance[axis]) * task.current
         asked = self._setting(axis, "motor.config.calibration_current")
         self._settings.find(axis, "motor.config.phase_resistance", volts / asked)
 
     def _keep_offset(self, axis: int, task: _Task) -> None:
-        """Keep the scan's mean count as the electrical zero: the axis is ready."""
+        """Store the scan's mean count as the electrical zero; the encoder is then ready."""
         mean = task.total // max(task.samples, 1)
         self._settings.find(axis, "encoder.config.phase_offset", float(mean))
         self.encoder[axis] = True

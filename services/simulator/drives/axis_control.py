@@ -5,11 +5,11 @@ pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim; input_v
 input_torque are each clamped to the same limits first. The firmware runs its loop at 8 kHz;
 here it is evaluated once a step.
 
-The current loop's 1 ms is left out of the torque, because it changes no joint's motion: a step's
-torque acts at once. The current that the firmware measures does follow the loop's bandwidth, and a
-change of the motor's speed drives it off by its EMF e until the loop has caught it, by
-e s / ((L s + R) (s + w)). Beyond current_lim and its margin of 8 A the firmware disarms. The
-estimates are those of `services.simulator.drives.axis_encoders`.
+The torque omits the current loop's lag of 1 ms, because it changes no joint's motion: a step's
+torque acts at once. The measured current does follow the loop's bandwidth. A change of the motor's
+speed disturbs it through the EMF e, by e s / ((L s + R) (s + w)), until the loop has compensated.
+Beyond current_lim plus its margin of 8 A the firmware disarms. The estimates are those of
+`services.simulator.drives.axis_encoders`.
 
 Pure: no clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns,
 turn/s, N m, A.
@@ -40,7 +40,7 @@ Vector = NDArray[np.float64]
 
 FIRMWARE_RATE_HZ: Final = 8000.0
 INTEGRATOR_DECAY: Final = 0.99
-"""Per firmware cycle in which the torque is limited."""
+"""Factor per firmware cycle in which the torque is limited."""
 
 _SETTINGS: Final = (
     "controller.config.control_mode",
@@ -65,11 +65,11 @@ _SETTINGS: Final = (
 _ROWS: Final = 5
 """Rows of the current loops' state: see `_LawResults.loops`."""
 _POWER: Final = 4 * N_JOINTS
-"""Where its last row begins."""
+"""Start of its last row."""
 
 
 class _LawResults(NamedTuple):
-    """What the law computes in a step; arrays (12,) but for the last."""
+    """Results of the law in a step; arrays (12,) unless another shape is given."""
 
     torque: Vector
     integrator: Vector
@@ -80,25 +80,25 @@ class _LawResults(NamedTuple):
     mechanical: Vector
     """Mechanical power of each motor, W."""
     over_current: Vector
-    """1 beyond the limit of the current and its margin."""
+    """1 beyond the current limit plus its margin."""
     loops: Vector
     """(60,), five rows: current, the EMF's rate behind the winding, the current that it drives, the
-    motor's true speed, and the filtered power of the torque that the controller asks for, armed or
+    motor's true speed, and the filtered power of the torque that the controller requests, armed or
     not; A, A/s, A, turn/s, W."""
     broken: Vector
-    """1 where the torque is no number, or the limit of the current none or negative."""
+    """1 if the torque is NaN, or the current limit NaN or negative."""
     extremes: Vector
-    """(3,): how many axes are beyond a limit, the least and the most power."""
+    """(3,): number of axes beyond a limit, minimum and maximum power, W."""
 
 
 class AxisControl:
     """Inputs and torque of all axes; no state machine, no errors.
 
     Attributes:
-        armed: 1.0 in closed loop: also the factor of the torque.
-        connected: 1.0 once in closed loop since it started up: from then on the controller sees the
-            encoder, in IDLE as well.
-        derating: fraction of current_lim that heat leaves.
+        armed: 1.0 in closed loop; also a factor of the torque.
+        connected: 1.0 from the first closed loop since start-up on; the controller then reads the
+            encoder, in IDLE too.
+        derating: fraction of current_lim that remains in heat.
         warmth: resistance of each winding over that at 25 C.
     """
 
@@ -115,7 +115,7 @@ class AxisControl:
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
         columns = [settings.axis(name) for name in _SETTINGS]
-        # what heats is the winding, whatever a calibration has found
+        # the true resistance heats the winding, whatever a calibration has found
         true_resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
         columns[_SETTINGS.index("motor.config.phase_resistance")] = true_resistance
         live = (
@@ -136,30 +136,30 @@ class AxisControl:
         return bool(np.dot(self._regulates, self.armed) > 0.0)
 
     def hold_here(self, axis: int) -> None:
-        """Make where the motor is its target, in position mode: `control_mode_updated`."""
+        """Set the target to the motor's position, in position mode: `control_mode_updated`."""
         if self._mode[axis] >= ControlMode.POSITION:
             self.input_pos[axis] = self._encoders.pos_estimate[axis]
 
     def arm(self, axis: int) -> None:
-        """Let an axis's torque through, from where it is; `input_torque` stays as it stands."""
+        """Enable an axis's torque at its present position; `input_torque` is unchanged."""
         self.hold_here(axis)
         self.integrator[axis] = self._loops[_POWER + axis] = 0.0
         self.armed[axis] = self.connected[axis] = 1.0
 
     def start(self, vel_turns: Vector) -> None:
-        """Take the motors' true speeds for those of before: nothing has changed yet."""
+        """Set the motors' previous true speeds, so that the first step sees no change."""
         self._loops[3 * N_JOINTS : _POWER] = vel_turns
 
     def turn(self, vel_turns: Vector) -> None:
-        """Take the motors' true speeds after a step."""
+        """Set the motors' true speeds after a step."""
         self._speed[:] = vel_turns
 
     def control(self) -> tuple[float, float, float]:
-        """Compute torques, powers and who is beyond a limit; the integrators stay as they are.
+        """Compute torques and powers, and check the limits; the integrators are unchanged.
 
         Returns:
-            How many axes are beyond their OVERSPEED or current limit or have no torque that is a
-            number (which: `failing`), and the least and the most power of an axis, W.
+            Number of axes that exceed their OVERSPEED or current limit or have a NaN torque (listed
+            by `failing`), and the minimum and maximum power of an axis, W.
         """
         if self._dt_s != self._encoders.dt_s:
             self._dt_s = self._encoders.dt_s
@@ -169,14 +169,14 @@ class AxisControl:
         return beyond, least, most
 
     def integrate(self) -> None:
-        """Take over the integrators and current loops that the last `control` arrived at."""
+        """Adopt the integrators and current loops of the last `control`."""
         self.integrator[:] = self.results.integrator
         self._loops[:] = self.results.loops
 
     def failing(self) -> list[tuple[int, str]]:
         """Return the axes that the last `control` disarms, each with its fault's name.
 
-        OVERSPEED is checked in IDLE all the same, the others on armed axes only.
+        OVERSPEED is checked in IDLE too, the others only on armed axes.
         """
         law = self.results
         checks = {
@@ -187,7 +187,7 @@ class AxisControl:
         return [(int(n), name) for name, axes in checks.items() for n in np.flatnonzero(axes)]
 
     def asked_power(self, axis: int) -> float:
-        """Return the filtered power of the torque that an axis's controller asks for, W."""
+        """Return the filtered power of the torque that an axis's controller requests, W."""
         return float(self._loops[_POWER + axis])
 
 
@@ -212,7 +212,7 @@ def law_graph() -> ca.Function:
     slowed = _clamp(torque, -of["vel_gain"] * (vel_limit + vel), of["vel_gain"] * (vel_limit - vel))
     limited = ca.logic_and(of["enable_torque_mode_vel_limit"] > 0.0, ca.logic_not(regulates))
     torque = ca.if_else(limited, slowed, torque)
-    # the velocity loop, under it the position loop, where the mode has them
+    # the velocity loop, with the position loop around it, if the mode has them
     clamp = ca.if_else(of["enable_vel_limit"] > 0.0, vel_limit, ca.inf)
     wanted = ca.if_else(position, of["pos_gain"] * (of["input_pos"] - of["pos"]), 0.0)
     wanted += _clamp(of["input_vel"], -clamp, clamp)
@@ -257,10 +257,10 @@ def law_graph() -> ca.Function:
 def _currents(
     of: dict[str, ca.SX], torque: ca.SX, loops: ca.SX, speed: ca.SX, dt_s: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Return the current loops after the step, and who is beyond the limit and its margin.
+    """Return the current loops after the step, and the axes beyond the limit plus its margin.
 
-    The EMF's rate x1 and what it drives x2 follow x1' = z - R / L x1, x2' = x1 - w x2 for a speed
-    that ramps over the step, z = e' / L. A limit that was lowered is checked a cycle later.
+    The EMF's rate x1 and the current x2 that it drives follow x1' = z - R / L x1, x2' = x1 - w x2
+    for a speed that ramps over the step, z = e' / L. A lowered limit is checked a cycle later.
     """
     current, x1, x2, speed_before, _ = ca.vertsplit(loops, N_JOINTS)
     w, kt, resistance = (
@@ -271,7 +271,7 @@ def _currents(
     current = wanted + (current - wanted) * ca.exp(-w * dt_s)
     rate = ca.if_else(dt_s > 0.0, (speed - speed_before) / dt_s, 0.0)
     z = -2.0 / 3.0 * kt * 2.0 * math.pi * rate / PHASE_INDUCTANCE
-    # a pole of the winding beside that of the loop; they are kept apart for the formula's sake
+    # the winding's pole is kept apart from the loop's, because the formula divides by the gap
     pole = resistance / PHASE_INDUCTANCE
     pole = ca.if_else(ca.fabs(pole - w) < 1e-3 * w, 1.001 * w, pole)
     pole = ca.fmax(pole, 1.0)
@@ -288,5 +288,5 @@ def _currents(
 
 
 def _clamp(value: ca.SX, low: ca.SX, high: ca.SX) -> ca.SX:
-    """Return a value within its limits; of a NaN, NaN, as the firmware's `std::clamp` does."""
+    """Return a value within its limits; NaN stays NaN, as in the firmware's `std::clamp`."""
     return ca.if_else(value < low, low, ca.if_else(value > high, high, value))

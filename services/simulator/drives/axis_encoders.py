@@ -3,9 +3,9 @@
 Firmware 0.5.6: a PLL estimates position and velocity from the encoder's whole counts. The firmware
 runs it at 8 kHz; here it is evaluated once a step, discretised exactly for the step's length. The
 firmware's estimate moves in quanta (one count in position, 0.0076 turn/s in velocity, which snaps
-to 0 below half of that); that is left out, because it changes no joint's motion. An axis that reads
-no words of its encoder, or wrong ones, is run cycle by cycle (`OddEncoder`). Pure: no clock, no
-I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns, turn/s.
+to 0 below half of that). The emulation omits them, because they change no joint's motion. An axis
+that reads no words of its encoder, or wrong ones, runs cycle by cycle (`OddEncoder`). Pure: no
+clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns, turn/s.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shared.joints import N_JOINTS
 Vector = NDArray[np.float64]
 
 _SPREAD: Final = 0.6180339887498949
-"""turn from one encoder's magnet to the next one's: angles as a robot has them, no two alike."""
+"""turn between the magnets of successive encoders, so that no two mounting angles are equal."""
 
 
 PERIOD_S: Final = 1.0 / 8000.0
@@ -33,7 +33,7 @@ ERROR_RATE_MAX: Final = 0.05
 
 
 class Words(Enum):
-    """What the drive reads from an encoder."""
+    """Words that the drive reads from an encoder."""
 
     TRUE = 0
     NONE = 1
@@ -41,38 +41,38 @@ class Words(Enum):
 
 
 def nearest(count: int, per_turn: int) -> int:
-    """Return a difference of counts by the nearest way: within half a turn."""
+    """Return a difference of counts, wrapped to within half a turn."""
     half = per_turn // 2
     return half - (half - count) % per_turn
 
 
 class OddEncoder:
-    """Firmware's state of one absolute encoder of which it reads no words, or zeros.
+    """Firmware's state of one absolute encoder from which it reads no words, or zeros.
 
-    Firmware 0.5.6 moves the count by the nearest way from the last word to the new one, so that
-    count and angle always agree within a turn, and a missing turn shows in neither. A word of 0
-    passes the parity: the count goes to the nearest turn of the encoder's own and stays, without an
-    error. A missing word leaves the count where it is. The share of missing words passes a filter
-    of 1 s: from empty it fails after 51 ms without words, and until then the axis stays armed and
-    blind. In counts of the encoder.
+    Firmware 0.5.6 moves the count by the wrapped difference between the last word and the new one.
+    Count and angle thus always agree within a turn, and neither shows a missing turn. A word of 0
+    passes the parity check: the count moves to the encoder's nearest whole turn and stays there,
+    without an error. A missing word leaves the count unchanged. The share of missing words passes a
+    filter of 1 s. From an empty filter the encoder fails after 51 ms without words; until then the
+    axis stays armed and blind. Units are counts of the encoder.
 
     Attributes:
         count: `shadow_count`.
         angle: `count_in_cpr`, the last word.
-        raw: the encoder's own count, with turns; no drive knows it.
-        pos: of the PLL, counts.
-        vel: of the PLL, counts/s.
-        words: what is read.
+        raw: the encoder's own count, with turns; unknown to the drive.
+        pos: position of the PLL, counts.
+        vel: velocity of the PLL, counts/s.
+        words: words that the drive reads.
         error_rate: filtered share of missing words.
-        fails: True if the firmware gave the last cycle up: ABS_SPI_COM_FAIL.
+        fails: True if the firmware aborted the last cycle: ABS_SPI_COM_FAIL.
         peak: largest speed of the last run, counts/s.
-        is_over: True once it has been read as it is for two runs: it is odd no more.
+        is_over: True once two runs have read true words, so the encoder is no longer odd.
     """
 
     def __init__(
         self, raw: int, count: int, pos: float, vel: float, *, per_turn: int, error_rate: float
     ) -> None:
-        """Take over an encoder that was read as it is so far."""
+        """Continue from an encoder with true words so far."""
         self._per_turn = per_turn
         self.count, self.raw = count, raw
         self.angle = raw % per_turn
@@ -85,7 +85,7 @@ class OddEncoder:
 
     @property
     def off_phase(self) -> float:
-        """How far the rotor is from where its drive believes it, turns."""
+        """Offset of the rotor from the angle that its drive assumes, turns."""
         return nearest(self.raw - self.angle, self._per_turn) / self._per_turn
 
     def set_count(self, count: int) -> None:
@@ -93,7 +93,7 @@ class OddEncoder:
         self.count, self.pos = count, float(count)
 
     def restart(self) -> None:
-        """Begin as at power-up: every register is 0."""
+        """Set every register to 0, as at power-up."""
         self.count = self.angle = 0
         self.pos = self.vel = self.error_rate = 0.0
         self.fails = False
@@ -131,22 +131,22 @@ class AxisEncoders:
 
     Attributes:
         counts_from: each drive's count at the true zero, a whole number.
-        mount: each encoder's own count at the true zero, within a turn: how its magnet sits. It may
-            be written before the first step.
+        mount: each encoder's own count at the true zero, within a turn, by how its magnet is
+            mounted. It may be written before the first step.
         pos_estimate: turns.
         vel_estimate: turn/s.
         turns: the drives' whole counts, in turns.
-        odd: the axes that do not read their encoders' words, by axis.
+        odd: encoders without true words, by axis.
         dt_s: length of the last step; 0 before the first and after a change of settings.
     """
 
     def __init__(self, settings: Settings, counts_per_turn: int) -> None:
-        """Take the settings, and the counts of the encoders themselves."""
+        """Bind the settings, and set the encoders' counts per turn."""
         self._settings = settings
         self._seen = -1
         self._counts_per_turn = counts_per_turn
         self.odd: dict[int, OddEncoder] = {}
-        self._error_rates: dict[int, tuple[float, float]] = {}  # as they were, and when
+        self._error_rates: dict[int, tuple[float, float]] = {}  # last value, and its time
         self._clock_s = 0.0
         self.counts_from = np.zeros(N_JOINTS)
         self.mount = np.floor(np.arange(1, N_JOINTS + 1) * _SPREAD % 1.0 * counts_per_turn)
@@ -158,14 +158,14 @@ class AxisEncoders:
         self.dt_s = 0.0
 
     def start(self, pos_turns: Vector, vel_turns: Vector) -> None:
-        """Take over the true state, as after a long time at rest."""
+        """Adopt the true state, as after a long rest."""
         self._derive()
         self._count(pos_turns)
         self._rows[0] = self._rows[2] = self._rows[3]
         self._rows[1] = vel_turns
 
     def set_count(self, axis: int, count: float) -> None:
-        """Set an axis's count where it is, as `set_linear_count` does; its angle stays."""
+        """Set an axis's count at its present position, like `set_linear_count`; the angle stays."""
         if self._seen != self._settings.version:
             self._derive()
         odd = self.odd.get(axis)
@@ -177,7 +177,7 @@ class AxisEncoders:
         self._rows[2:, axis] = self._rows[0, axis] = round(count) / self._cpr[axis]
 
     def forget_turns(self, axis: int) -> None:
-        """Make an axis's encoder know its angle within a turn only, as at power-up."""
+        """Reduce an axis's count to the angle within a turn, as at power-up."""
         odd = self.odd.get(axis)
         self.clear_errors(axis)
         if odd is not None:
@@ -200,11 +200,11 @@ class AxisEncoders:
         return round(float(self._rows[3, axis] * self._cpr[axis]))
 
     def wrap_turns(self, axis: int) -> None:
-        """Make an axis's count its angle within the turn, as its encoder's calibration does."""
+        """Set an axis's count to its angle in the turn, as the encoder's calibration does."""
         self.set_count(axis, self.angle(axis))
 
     def read_words(self, axis: int, words: Words) -> None:
-        """Let an axis read no words of its encoder, zeros, or its own again."""
+        """Make an axis read no words of its encoder, zeros, or true words again."""
         if self._seen != self._settings.version:
             self._derive()
         odd = self.odd.get(axis)
@@ -259,7 +259,7 @@ class AxisEncoders:
         ]
 
     def commutate(self, torque: Vector) -> None:
-        """Turn the odd axes' torques to what a rotor gives that is away from its last word."""
+        """Scale the odd axes' torques, because their rotors have moved from the last word."""
         poles = self._settings.axis("motor.config.pole_pairs")
         for axis, odd in self.odd.items():
             torque[axis] *= math.cos(2.0 * math.pi * poles[axis] * odd.off_phase)
@@ -280,7 +280,7 @@ class AxisEncoders:
                 del self.odd[axis]
 
     def _raw(self, axis: int) -> int:
-        """Return an encoder's own count, with turns; of an odd one only once `_count` has run."""
+        """Return an encoder's own count, with turns; for an odd one only after `_count`."""
         return self.counted(axis) - round(float(self.counts_from[axis] - self.mount[axis]))
 
     def _count(self, pos_turns: Vector) -> None:

@@ -1,11 +1,11 @@
 """Faults of the emulated drives: error registers by name, and conditions that last.
 
-What firmware 0.5.6 leaves in its registers. What fails in the motor, the encoder or the
-controller is in `axis.error` too (up to 0.5.4 that stayed 0); a controller that fails gives no
-torque, so the motor misses its command in the same cycle.
+The registers are those of firmware 0.5.6. A failure of motor, encoder or controller also sets
+`axis.error` (up to 0.5.4 that stayed 0). A failed controller gives no torque, so the motor misses
+its command in the same cycle.
 
-A condition (power, cable, heat, encoder) lasts until it is ended, and acts again at every step:
-errors that are cleared in the heat return at once.
+A condition (power, cable, heat, encoder) acts at every step until it ends: errors that are cleared
+while the drive is hot return at once.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ AXIS_NAMES: Final = tuple(f"{module}.axis{index}" for module in MODULES for inde
 
 
 class AxisErrors(NamedTuple):
-    """The error registers of an axis, and that of its ODrive."""
+    """Error registers of an axis, and that of its ODrive."""
 
     axis: int = 0
     motor: int = 0
     encoder: int = 0
     controller: int = 0
     odrive: int = 0
-    """`odrv.error`; the same on both axes, for its errors disarm both."""
+    """`odrv.error`; the same on both axes, because its errors disarm both."""
 
     def with_(self, other: AxisErrors) -> AxisErrors:
-        """Return both together."""
+        """Return the union of both."""
         return AxisErrors(*(a | b for a, b in zip(self, other, strict=True)))
 
 
@@ -49,26 +49,26 @@ _MOTOR: Final = AxisError.MOTOR_FAILED
 
 
 def motor_fault(error: MotorError) -> AxisErrors:
-    """Return what a failed motor leaves."""
+    """Return the errors of a failed motor."""
     return AxisErrors(_MOTOR, motor=error)
 
 
 def encoder_fault(error: EncoderError) -> AxisErrors:
-    """Return what a failed encoder leaves."""
+    """Return the errors of a failed encoder."""
     return AxisErrors(AxisError.ENCODER_FAILED, encoder=error)
 
 
 def controller_fault(error: ControllerError) -> AxisErrors:
-    """Return the torque of a failed controller: none."""
+    """Return the errors of a failed controller, which gives no torque."""
     no_command = MotorError.UNKNOWN_TORQUE | MotorError.UNKNOWN_VOLTAGE_COMMAND
     axis = AxisError.CONTROLLER_FAILED | _MOTOR
     return AxisErrors(axis, motor=no_command, controller=error)
 
 
 def in_idle(fault: AxisErrors, *, connected: bool) -> AxisErrors:
-    """Return what a fault leaves on an axis in IDLE, whose motor misses no command.
+    """Return a fault's errors on an axis in IDLE, whose motor misses no command.
 
-    Until its first closed loop a controller is not connected: it sees no invalid estimate.
+    Before its first closed loop a controller is not connected, so it detects no invalid estimate.
     """
     if not fault.controller:
         return fault
@@ -98,11 +98,11 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
 }
 """Faults of an axis by name, for `AxisBank.inject`; its sibling keeps its torque unless shared.
 
-DISARM is the silent one: IDLE and no error at all.
+DISARM is silent: IDLE without an error.
 """
 
 SHARED_FAULTS: Final = frozenset({"DRV_FAULT"})
-"""Faults that both axes of an ODrive have at once: its gate drivers share their fault line."""
+"""Faults that both axes of an ODrive have at once, because its gate drivers share a fault line."""
 
 
 def _system(error: OdriveError) -> AxisErrors:
@@ -129,9 +129,9 @@ class Conditions:
     Attributes:
         down: the drives (0 .. 5) that are without power, or do not communicate yet.
         starting: the drives whose axes do not run yet, and take no state.
-        silent: the axes (0 .. 11) without communication: down, or the cable out.
-        deaf: the axes (0 .. 11) that hear and acknowledge nothing, and send all the same.
-        choked: the axes (0 .. 11) to which the bus takes no frame: its send queue is full.
+        silent: the axes (0 .. 11) without communication: down, or with the cable out.
+        deaf: the axes (0 .. 11) that receive and acknowledge nothing, but still send.
+        choked: the axes (0 .. 11) whose bus accepts no frames, because its send queue is full.
         heat: motors, output stages and their thermistors.
     """
 
@@ -144,11 +144,11 @@ class Conditions:
         self.deaf: set[int] = set()
         self.choked: set[int] = set()
         self._linked = [True] * N_DRIVES
-        self._on_s = [-math.inf] * N_DRIVES  # when each had its power; inf: it has none
+        self._on_s = [-math.inf] * N_DRIVES  # power-up time of each; inf without power
 
     @property
     def all_well(self) -> bool:
-        """True if no axis has to be looked at."""
+        """True if no axis needs a check."""
         return not (self.starting or self._encoders.odd or self.heat.hot)
 
     def link(self, drive: int, *, up: bool) -> None:
@@ -157,17 +157,17 @@ class Conditions:
         self._update_silent()
 
     def deafen(self, drive: int, *, deaf: bool) -> None:
-        """Break a drive's receiver, or mend it."""
+        """Break a drive's receiver, or repair it."""
         axes = (2 * drive, 2 * drive + 1)
         (self.deaf.update if deaf else self.deaf.difference_update)(axes)
 
     def choke(self, drive: int, *, full: bool) -> None:
-        """Fill the send queue of a drive's bus with frames of others, or empty it."""
+        """Fill the send queue of a drive's bus with frames of other nodes, or empty it."""
         axes = (2 * drive, 2 * drive + 1)
         (self.choked.update if full else self.choked.difference_update)(axes)
 
     def boot(self, drive: int, now_s: float) -> None:
-        """Let a drive start up from now on."""
+        """Start to boot a drive."""
         self.down.add(drive)
         self.starting.add(drive)
         self._on_s[drive] = now_s
@@ -182,7 +182,7 @@ class Conditions:
         return self._on_s[drive] == math.inf
 
     def finish_boots(self, now_s: float) -> list[int]:
-        """Return the drives whose axes begin to run by now; let others communicate."""
+        """Return the drives whose axes run from now on; let drives communicate when due."""
         up = [drive for drive in self.down if self._on_s[drive] + TALKS_S <= now_s]
         if up:
             self.down.difference_update(up)
@@ -192,11 +192,11 @@ class Conditions:
         return begin
 
     def read_encoder(self, axis: int, words: Words) -> None:
-        """Let an axis read no words of its encoder, zeros, or its own again."""
+        """Make an axis read no words of its encoder, zeros, or true words again."""
         self._encoders.read_words(axis, words)
 
     def disarming(self) -> list[tuple[int, AxisErrors]]:
-        """Return the axes that a condition disarms, and with what."""
+        """Return the axes that a condition disarms, with their errors."""
         odd = self._encoders.odd
         failing = [(axis, FAULTS["ENCODER"]) for axis in sorted(odd) if odd[axis].fails]
         names = {False: "OVER_TEMP", True: "MOTOR_OVER_TEMP"}

@@ -1,14 +1,14 @@
 """Heat of the emulated axes: motors, output stages, thermistors, and derating. Pure.
 
-Two nodes for each motor, one for each output stage; Iq is the motor's current:
+Each motor has two thermal nodes, each output stage one; Iq is the motor's current:
 
     C_w T_w' = 1.5 R Iq^2 - (T_w - T_h) / R_wh        R = R_25 (1 + alpha (T_w - 25 C))
     C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha
     t_s T_s' = T_a + k_s Iq^2 - T_s
 
-A thermistor's reading passes two low-passes of 0.1 s, as in firmware 0.5.6. Between its two limits
-the current limit falls in proportion to nothing; `OVER_TEMP_MARGIN` beyond the upper one the axis
-disarms. So a stage that is heated at once derates first and disarms 0.5 s later.
+A thermistor's reading passes two low-passes of 0.1 s, as in firmware 0.5.6. Between its two
+temperature limits the current limit falls linearly to zero; `OVER_TEMP_MARGIN` above the upper one
+the axis disarms. A stage that heats up suddenly thus derates first and disarms 0.5 s later.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ OVER_TEMP_MARGIN: Final = 5.0
 FILTER_S: Final = 0.1
 """Time constant of each of a thermistor's two low-passes."""
 SETTLED: Final = 0.05
-"""C; a reading nearer to the truth than this is taken as the truth."""
+"""C; a reading within this of the truth counts as settled."""
 EVERY_S: Final = 0.1
 """Step of the slow temperatures."""
 COPPER: Final = 0.00393
@@ -44,29 +44,29 @@ Kelvins = Annotated[float, Range(-50.0, 200.0, "K")]
 
 
 class Heat(Section, frozen=True):
-    """How motors and output stages warm up: each motor, and each axis of a drive, alike.
+    """Thermal model of motors and output stages, the same for all motors and axes.
 
-    Assumed, but for the output stage: measure the motors.
+    The motors' values are assumed: measure the motors.
     """
 
     ambient: Annotated[float, Range(-40.0, 60.0, "C")] = 25.0
     warm: Kelvins = 0.0
-    """Motors and output stages begin this much warmer than the air."""
+    """Initial temperature of motors and output stages above the air."""
     resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = PHASE_RESISTANCE
     """Resistance of a phase at 25 C. Assumed: an outrunner of some 80 mm with 100 rpm/V."""
     winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
     """0.2 kg of copper (385 J/(kg K)) and its share of the teeth. Assumed."""
     winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5
-    """With the winding's capacity a time constant of 50 s, usual for this size. Assumed."""
+    """With the winding's capacity, a time constant of 50 s, usual for this size. Assumed."""
     housing_capacity: Annotated[float, Range(1.0, 1e5, "J/K")] = 1500.0
     """Half of a module's 8.73 kg belongs to each motor; 3 kg of steel and aluminium take part.
     Assumed."""
     housing_to_air: Annotated[float, Range(0.01, 50.0, "K/W")] = 1.2
     """0.08 m^2 of housing and links at 10 W/(m^2 K), free convection and radiation. Assumed."""
     stage_per_square_ampere: Annotated[float, Range(0.0, 1.0, "K/A^2")] = 0.054
-    """Rise of an output stage as its thermistor reads it. 40 A for ever, heat sink in still air at
-    13 C, is the most that a user measured on a v3.5 with 48 V (ODrive's forum, thread 972): there
-    it is taken to read 100 C."""
+    """Rise of an output stage as its thermistor reads it. On a v3.5 with 48 V, a user measured at
+    most 40 A continuously, with the heat sink in still air at 13 C (ODrive's forum, thread 972).
+    The thermistor is assumed to read 100 C there."""
     stage_s: Annotated[float, Range(1.0, 1e4, "s")] = 200.0
     """Time constant of the heat sink. Assumed."""
     motor_thermistor: bool = False
@@ -78,17 +78,17 @@ class AxisHeat:
     """Temperatures of the twelve axes; every array is indexed by axis, (12,), C.
 
     Attributes:
-        winding: of the motors.
-        housing: of the motors.
-        stage: of the output stages.
-        fet: what the output stages' thermistors read.
-        motor: what the motors' thermistors read; 0 where there is none.
+        winding: windings of the motors.
+        housing: housings of the motors.
+        stage: output stages.
+        fet: readings of the output stages' thermistors.
+        motor: readings of the motors' thermistors; 0 without a thermistor.
         load: mean squared torques of the last slow step, (N m)^2.
-        hot: axes whose firmware disarms them, with True if it is for the motor.
+        hot: axes that the firmware disarms; True for the motor, False for the output stage.
     """
 
     def __init__(self, settings: Settings, control: AxisControl, heat: Heat) -> None:
-        """Begin at the plant's temperatures; derate the current limits of `control`."""
+        """Start at the plant's temperatures; derate the current limits of `control`."""
         self._settings, self._control, self._heat = settings, control, heat
         start = heat.ambient + heat.warm
         self.winding, self.housing, self.stage = np.full((3, N_JOINTS), start)
@@ -119,7 +119,7 @@ class AxisHeat:
             self._filter(dt_s)
 
     def skip(self, square: Vector, seconds: float) -> None:
-        """Let time pass for the temperatures alone, under a mean squared torque (12,), (N m)^2."""
+        """Advance the temperatures alone, under a mean squared torque (12,), (N m)^2."""
         while seconds > 0.0:
             step_s = min(1.0, seconds)
             self._slow_step(square, step_s)
@@ -127,7 +127,7 @@ class AxisHeat:
         self._read()
 
     def force(self, axis: int, celsius: float | None) -> None:
-        """Bring an axis's output stage to a temperature, and keep it there; None: let it go."""
+        """Hold an axis's output stage at a temperature; None releases it."""
         if celsius is None:
             self._forced.pop(axis, None)
         else:
@@ -136,7 +136,7 @@ class AxisHeat:
 
     @property
     def derating(self) -> float:
-        """Least fraction of an axis's current limit that heat leaves."""
+        """Smallest fraction of an axis's current limit that remains in heat."""
         return float(self._control.derating.min())
 
     def numbers(self) -> tuple[float, ...]:
@@ -144,7 +144,7 @@ class AxisHeat:
         return tuple(np.concatenate((self.winding, self.housing, self.stage)).tolist())
 
     def set_numbers(self, numbers: tuple[float, ...]) -> None:
-        """Continue from another's temperatures; none: stay at the plant's."""
+        """Restore temperatures from `numbers`; if empty, keep the plant's."""
         if numbers:
             self.winding[:], self.housing[:], self.stage[:] = np.array(numbers).reshape(3, -1)
             self._read()
@@ -176,7 +176,7 @@ class AxisHeat:
         return raw
 
     def _read(self) -> None:
-        """Read the thermistors, where nothing steps: the filters lag by less than can be seen."""
+        """Read the thermistors between jumps, when the filters' lag is negligible."""
         if self._heat.motor_thermistor:
             self.motor[:] = self.winding
         if not self._filtering:
@@ -192,7 +192,7 @@ class AxisHeat:
         self._derate()
 
     def _derate(self) -> None:
-        """Derate the current limits, and find out who disarms."""
+        """Derate the current limits, and find the axes that disarm."""
         settings, derating = self._settings, self._control.derating
         derating[:] = 1.0
         self.hot.clear()

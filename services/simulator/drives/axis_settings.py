@@ -1,8 +1,8 @@
 """Settings of the emulated drives by the firmware's names: a plain table {name: value}.
 
-What ODrive ships with firmware 0.5.6; what this robot wants instead is in
-`shared.can.drive_settings`. One column for each name, for all drives at once: the emulation reads
-its limits from the columns, a front reads and writes single values by name.
+The defaults are those of firmware 0.5.6; this robot's values are in `shared.can.drive_settings`.
+Each name has one column for all drives: the emulation reads its limits from the columns, a front
+reads and writes single values by name.
 
 Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The over-voltage
 level is that of the 56 V board.
@@ -84,7 +84,7 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "encoder.config.calib_scan_omega": 4.0 * math.pi,
     "encoder.config.pre_calibrated": False,
 }
-"""Settings of each axis, below `axis0.` and `axis1.`: the default, whose type is the setting's."""
+"""Settings of each axis, below `axis0.` and `axis1.`, with defaults of the settings' types."""
 
 DRIVE_SETTINGS: Final[Mapping[str, Value]] = {
     "config.dc_bus_undervoltage_trip_level": 8.0,
@@ -105,29 +105,29 @@ NAMES: Final = (
 """Every setting of one ODrive."""
 
 PHASE_RESISTANCE: Final = 0.1
-"""ohm; assumed, of a motor with this torque constant. Calibration finds it, nobody sets it."""
+"""ohm; assumed for a motor with this torque constant. Found by calibration, never set by hand."""
 PHASE_INDUCTANCE: Final = 5e-5
-"""H; assumed, likewise."""
+"""H; assumed for the same motor. Found by calibration, never set by hand."""
 POLE_PAIRS: Final = 7
-"""Pole pairs of the motors themselves, whatever a drive's setting says; assumed."""
+"""True pole pairs of the motors, whatever a drive's setting says; assumed."""
 ENCODER_MODE: Final = 257
 """Absolute over SPI, AMS; set by hand before anything is calibrated."""
 CALIBRATION_CURRENT: Final = 15.0
-"""A; set by hand as well: the 10 A as shipped do not turn a knee that hangs on its stop."""
+"""A; set by hand too, because the default of 10 A does not turn a knee that hangs on its stop."""
 DIRECTION: Final = 1
-"""+1 or -1 by how a motor's phases are wired. Calibration finds it, nobody sets it."""
+"""+1 or -1, by the wiring of a motor's phases. Found by calibration, never set by hand."""
 
 
 class Settings:
     """The settings of all drives.
 
     Attributes:
-        version: counts the values that were set by name; who derives something from a
-            column looks here for whether it still holds.
+        version: number of values that were set by name. Code that caches a column compares it to
+            detect a change.
     """
 
     def __init__(self) -> None:
-        """Start with what ODrive ships."""
+        """Start with ODrive's defaults."""
         self.version = 0
         self._axes = {name: np.full(N_JOINTS, float(v)) for name, v in AXIS_SETTINGS.items()}
         self._drives = {name: np.full(N_DRIVES, float(v)) for name, v in DRIVE_SETTINGS.items()}
@@ -157,18 +157,18 @@ class Settings:
         """Set a setting of a drive by its name in `NAMES`.
 
         Raises:
-            DriveError: there is no such setting, or the value is not of its type.
+            DriveError: the setting is unknown, or the value is not of its type.
         """
         column, row, default = self._find(drive, name)
         number = float(value)
         whole = isinstance(default, int)
         if math.isnan(number) or (whole and not number.is_integer()):
-            raise DriveError(f"{name} = {value!r}: it wants a {type(default).__name__}")
+            raise DriveError(f"{name} = {value!r}: it must be a {type(default).__name__}")
         column[row] = bool(value) if isinstance(default, bool) else number
         self.version += 1
 
     def find(self, axis: int, name: str, value: float) -> None:
-        """Set what a calibration of an axis (0 .. 11) found; NaN where it found nothing."""
+        """Set the value that a calibration of an axis (0 .. 11) found; NaN if it found none."""
         self._axes[name][axis] = value
         self.version += 1
 
@@ -193,7 +193,7 @@ class Settings:
         """Restore a drive's saved settings, as a restart does."""
         for name, value in self._saved[drive].items():
             column, row, _ = self._find(drive, name)
-            column[row] = value  # a NaN as well
+            column[row] = value  # even a NaN
         self.version += 1
 
     def _find(self, drive: int, name: str) -> tuple[Vector, int, Value]:
@@ -204,8 +204,8 @@ class Settings:
         if head in ("axis0", "axis1") and rest in AXIS_SETTINGS:
             return self._axes[rest], 2 * drive + int(head[-1]), AXIS_SETTINGS[rest]
         near = difflib.get_close_matches(name, NAMES, n=1)
-        hint = f"; the nearest is {near[0]}" if near else ""
-        raise DriveError(f"no setting {name!r}{hint}")
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise DriveError(f"unknown setting {name!r}{hint}")
 
 
 def configured(

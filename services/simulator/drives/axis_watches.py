@@ -1,4 +1,4 @@
-"""What the firmware watches of an axis: its watchdog, and spinout after it was disarmed. Pure."""
+"""The firmware's checks of an axis: its watchdog, and spinout after disarming. Pure."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ _BELOW: Final = "controller.config.spinout_"
 
 
 class Watchdogs:
-    """Watchdogs of all axes: each runs on from the time that it was fed with last.
+    """Watchdogs of all axes; each counts down the timeout of its last feed.
 
-    Firmware 0.5.6: feeding loads a counter with the timeout of that moment, and only an enabled
-    watchdog counts it down. One that is enabled before it was fed has nothing left, and expires at
+    Firmware 0.5.6: feeding loads a counter with the present timeout, and only an enabled watchdog
+    counts it down. A watchdog that is enabled before it was fed has a counter of 0 and expires at
     once; setting its timeout meanwhile does not feed it.
     """
 
     def __init__(self, settings: Settings) -> None:
-        """Take the settings; power-up feeds them."""
+        """Bind the settings; power-up feeds the watchdogs."""
         self._settings = settings
         self._seen = -1
         self._timeouts_s = [0.0] * N_JOINTS
-        self._left_s = [0.0] * N_JOINTS  # of those that are off
-        self._off_s = [math.inf] * N_JOINTS  # 0 or infinite
+        self._left_s = [0.0] * N_JOINTS  # of disabled watchdogs
+        self._off_s = [math.inf] * N_JOINTS  # infinite if disabled, else 0
         self._expire_s = [math.inf] * N_JOINTS
 
     def feed(self, axis: int, now_s: float) -> None:
@@ -62,33 +62,33 @@ class Watchdogs:
 class Spinout:
     """SPINOUT_DETECTED of the axes that were disarmed under load.
 
-    Firmware 0.5.6: a filter of the motor's electrical power less its copper losses goes on with its
-    last value, while that of the mechanical power follows the torque that the controller would
-    give. An axis that was lifting, and sinks now, brakes with power: a spinout, in IDLE. Armed
-    emulated motors have both powers equal, as both are taken without the copper loss: none spins
+    Firmware 0.5.6: after disarming, the filter of electrical power minus copper losses continues
+    with its last input. The filter of mechanical power follows the torque that the controller would
+    give. An axis that was lifting and now sinks seems to brake with power: a spinout, in IDLE. For
+    armed emulated motors both powers exclude the copper loss and are equal, so no armed axis spins
     out.
 
     Attributes:
-        watched: the filtered power of each, and the last one before, W.
+        watched: filtered electrical power of each axis, and its last input, W.
     """
 
     def __init__(self, settings: Settings) -> None:
-        """Take the settings: the thresholds."""
+        """Set the thresholds from the settings."""
         self._mechanical = settings.axis(_BELOW + "mechanical_power_threshold")
         self._electrical = settings.axis(_BELOW + "electrical_power_threshold")
         self.watched: dict[int, tuple[float, float]] = {}
 
     def disarmed(self, axis: int, filtered: float, last: float) -> None:
-        """Watch an axis that is disarmed at these powers, if they are high enough, W."""
+        """Watch an axis that is disarmed at these powers, W, if they are high enough."""
         if max(filtered, last) > self._electrical[axis]:
             self.watched[axis] = filtered, last
 
     def armed(self, axis: int) -> None:
-        """End the watch: both filters start again."""
+        """End the watch, because both filters restart."""
         self.watched.pop(axis, None)
 
     def check(self, dt_s: float, mechanical: dict[int, float]) -> list[int]:
-        """Return the axes that spin out, by each one's filtered mechanical power, W."""
+        """Return the axes that spin out, from their filtered mechanical powers, W."""
         share = 1.0 - math.exp(-BANDWIDTH * dt_s)
         spun = []
         for axis, (filtered, last) in self.watched.items():

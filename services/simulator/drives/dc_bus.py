@@ -1,9 +1,9 @@
 """The DC bus of each emulated ODrive: current of its motors and of regeneration.
 
-The supply is a constant voltage behind a resistance and takes current both ways, as a battery does.
-The current is that of the mechanical power and the copper losses: I_bus = sum(torque 2 pi vel + 1.5
-R Iq^2) / V_bus, Iq = torque / torque_constant; the 1.5 is due to the firmware's amplitude-invariant
-currents. A brake resistor takes regenerated current beyond `max_regen_current`.
+The supply is a constant voltage behind a resistance and accepts current both ways, like a battery.
+The current covers mechanical power and copper losses: I_bus = sum(torque 2 pi vel + 1.5 R Iq^2) /
+V_bus, Iq = torque / torque_constant; the 1.5 is due to the firmware's amplitude-invariant currents.
+A brake resistor dissipates regenerated current beyond `max_regen_current`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SUPPLY_VOLTAGE: Final = 48.0
 SUPPLY_RESISTANCE: Final = 0.05
 """ohm, of battery and cable; assumed."""
 DEAD_VOLTAGE: Final = 6.0
-"""V; below it the processor stops as well."""
+"""V; below it the processor stops too."""
 BRAKE_DUTY_MAX: Final = 0.95
 
 
@@ -30,11 +30,11 @@ class DcBus:
 
     Attributes:
         supply: voltage of each supply (6,), V.
-        resistance: of each supply (6,), ohm.
+        resistance: resistance of each supply (6,), ohm.
     """
 
     def __init__(self, settings: Settings, power: Vector, mechanical: Vector) -> None:
-        """Take the settings, and the motors' electrical and mechanical powers (12,), W."""
+        """Bind the settings, and the motors' electrical and mechanical powers (12,), W."""
         self._settings = settings
         self._seen = -1
         self.supply = np.full(N_DRIVES, SUPPLY_VOLTAGE)
@@ -42,13 +42,13 @@ class DcBus:
         self._power, self._mechanical = power, mechanical
 
     def changed(self) -> None:
-        """Say that a supply has been changed."""
+        """Record that a supply has changed."""
         self._seen = -1
 
     def check(self, least: float, most: float) -> dict[int, str]:
         """Return the drives (0 .. 5) that their limits disarm, each with a name in `BUS_FAULTS`.
 
-        `least` and `most` are the least and the most power of a motor now, W.
+        `least` and `most` are the present minimum and maximum power of a motor, W.
         """
         if self._seen != self._settings.version:
             self._derive()
@@ -56,16 +56,16 @@ class DcBus:
         return self._trips() if near or self._always else {}
 
     def state(self, drive: int) -> tuple[float, float]:
-        """Return a drive's bus voltage in V and current in A, positive: drawn."""
+        """Return a drive's bus voltage, V, and current, A, positive if drawn."""
         voltage, current = self._solve()
         return float(voltage[drive]), float(current[drive])
 
     def powers(self, axis: int) -> tuple[float, float]:
-        """Return an axis's electrical and mechanical power in W, as the last check had them."""
+        """Return an axis's electrical and mechanical power at the last check, W."""
         return float(self._power[axis]), float(self._mechanical[axis])
 
     def _derive(self) -> None:
-        """Work out constants, and the power below which no limit can be near."""
+        """Compute the constants, and the power below which no limit can be near."""
         settings = self._settings
         self._seen = settings.version
         self._lowest = settings.drive("config.dc_bus_undervoltage_trip_level").copy()
@@ -76,7 +76,7 @@ class DcBus:
         brake = settings.drive("config.brake_resistance")
         self._brake_max = np.where(braking, BRAKE_DUTY_MAX / brake, 0.0)  # A per V
         self._regen_free = settings.drive("config.max_regen_current").copy()
-        # Each axis may do half of a drive's limit, less a half for the voltage's own change.
+        # Each axis may use half of a drive's limit, halved again for the change of voltage.
         resistance = np.maximum(self.resistance, 1e-6)
         push = np.minimum(-self._negative, (self._highest - self.supply) / resistance)
         draw = np.minimum(self._positive, (self.supply - self._lowest) / resistance)

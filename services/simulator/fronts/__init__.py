@@ -1,1 +1,1 @@
-"""How drives and sensors are seen from outside: CAN frames, USB endpoints."""
+"""Interfaces of the simulated drives and sensors: CAN frames, USB endpoints."""

@@ -1,7 +1,7 @@
-"""The two dialects of CANSimple as the emulated drives speak them.
+"""The two dialects of CANSimple that the emulated drives use.
 
-Firmware 0.5 and 0.6 share set-points, limits and gains; `DIALECTS` holds what differs. A trap of
-0.5.6: its encoder frames say 0, 0 from each start-up until the first closed loop. Endpoint ids of
+Firmware 0.5 and 0.6 share setpoints, limits and gains; `DIALECTS` holds the differences. A trap of
+0.5.6: its encoder frames contain 0, 0 from start-up until the first closed loop. Endpoint ids of
 0.6 come with each firmware's `flat_endpoints.json`; the emulation's are `SDO_ENDPOINTS`.
 """
 
@@ -68,7 +68,7 @@ _ERRORS_06: Final[tuple[tuple[str, int, DriveError06], ...]] = (
     ("odrive", OdriveError.DC_BUS_OVER_REGEN_CURRENT, DriveError06.DC_BUS_OVER_REGEN_CURRENT),
     ("odrive", OdriveError.DC_BUS_OVER_CURRENT, DriveError06.DC_BUS_OVER_CURRENT),
 )
-"""A bit of a 0.5 register, and what 0.6 calls it."""
+"""Register and bit of 0.5, and the error of 0.6."""
 
 _RESULTS_06: Final[tuple[tuple[str, int, ProcedureResult], ...]] = (
     ("encoder", EncoderError.CPR_POLEPAIRS_MISMATCH, ProcedureResult.POLE_PAIR_CPR_MISMATCH),
@@ -85,7 +85,7 @@ _RESULTS_06: Final[tuple[tuple[str, int, ProcedureResult], ...]] = (
         ProcedureResult.PHASE_INDUCTANCE_OUT_OF_RANGE,
     ),
 )
-"""A bit of a 0.5 register, and what 0.6 says of the procedure that ended with it."""
+"""Register and bit of 0.5, and the procedure result of 0.6."""
 
 SDO_ENDPOINTS: Final[Mapping[int, str]] = dict(
     enumerate(("vbus_voltage", "ibus", *DRIVE_SETTINGS, *AXIS_SETTINGS), start=1)
@@ -99,23 +99,23 @@ _READINGS: Final = ("vbus_voltage", "ibus")
 
 
 class Dialect(NamedTuple):
-    """Frames that a firmware encodes in its own way."""
+    """Frames whose encoding depends on the firmware."""
 
     heartbeat: Answer
     estimates: Callable[[AxisBank], tuple[Vector, Vector]]
-    """Position and velocity of all axes (12,) as their frames have them."""
+    """Position and velocity of all axes (12,), as in their frames."""
     answers: Mapping[int, Answer]
-    """By command, to a request for data."""
+    """Answers to requests for data, by command."""
     asked: Mapping[int, Callable[[AxisBank, int, bytes], bytes | None]]
-    """By command, to a frame of any length and its eight bytes; None: no answer."""
+    """Answers to frames of any length, from their eight bytes, by command; None for no answer."""
     sdo: Callable[[AxisBank, int, bytes], bytes | None] | None
-    """Takes 0x004 and returns the payload of 0x005, if there is an answer."""
+    """Maps the payload of 0x004 to that of 0x005; None for no answer."""
     setters: Mapping[int, Setter]
-    """By command, in place of the front's own."""
+    """Setters by command, which replace the front's own."""
 
 
 def errors_06(fault: AxisErrors) -> DriveError06:
-    """Return 0.5's registers as 0.6 has them."""
+    """Return the 0.6 errors for the 0.5 registers."""
     errors = DriveError06.NONE
     for register, bit, error in _ERRORS_06:
         if getattr(fault, register) & bit:
@@ -140,7 +140,7 @@ def _heartbeat_06(bank: AxisBank, axis: int) -> bytes:
 
 
 def _estimates_05(bank: AxisBank) -> tuple[Vector, Vector]:
-    """Return the controllers' estimates, which 0.5.6 reports: zero before they have run."""
+    """Return the controllers' estimates, which 0.5.6 reports: zero until the controllers run."""
     connected = bank.connected > 0.0
     return np.where(connected, bank.pos_estimate, 0.0), np.where(connected, bank.vel_estimate, 0.0)
 
@@ -170,14 +170,14 @@ def _adc_voltage(_bank: AxisBank, _axis: int, data: bytes) -> bytes | None:
 
 
 def _twice(value: float) -> bytes:
-    """Return a frame of two floats for what is set-point and measurement at once."""
+    """Return a frame of two floats with one value as both setpoint and measurement."""
     return cansimple.pack_two_floats(value, value)
 
 
 def _sdo(bank: AxisBank, axis: int, data: bytes) -> bytes | None:
-    """Read or write an endpoint; both are answered, with the value, unless it does not exist.
+    """Read or write an endpoint; return its value as the answer, or None if it does not exist.
 
-    Firmware 0.6.11 and later confirms a write. A value that is not a number is not written, and not
+    Firmware 0.6.11 and later confirm a write. A value that is not a number is neither written nor
     confirmed.
     """
     opcode, endpoint, value = cansimple_06.unpack_sdo(data)
@@ -214,7 +214,7 @@ def _full(name: str, axis: int) -> str:
 
 
 def _sdo_layout(value: Value) -> str:
-    """Return the `struct` layout of an endpoint with such a value."""
+    """Return the `struct` layout of an endpoint with this type of value."""
     if isinstance(value, bool):
         return "<?"
     return "<I" if isinstance(value, int) else "<f"

@@ -23,18 +23,18 @@ from shared.joints import N_JOINTS
 _DATA_BYTES = 8
 _SDO_BYTES = 4
 _MAILBOXES = 3
-_EARLY_S = 1e-6  # a period that is over but for rounding is over
+_EARLY_S = 1e-6  # tolerance of a period's end for rounding
 _S_PER_MS = 1e-3
 _FLOAT = struct.Struct("<f").unpack_from
 _FLAGGED_ID = REMOTE_FLAG | cansimple.NODE_MASK << cansimple.COMMAND_BITS | cansimple.COMMAND_MASK
 
 
 class CanSimpleFront:
-    """Applies received frames to the bank and sends its estimates and heartbeats.
+    """CAN front of the bank: applies received frames, sends estimates and heartbeats.
 
     `nodes[i]` maps the CAN node ids on `hubs[i]` to axes of the bank. A drive that does not
-    communicate (no power, starting up, cable out) neither receives nor sends, nor acknowledges:
-    on a bus without any other node frames wait until it is back. An axis's settings give its
+    communicate (no power, starting up, cable out) neither receives, sends nor acknowledges. On a
+    bus without another node, frames wait until it returns. An axis's settings give its
     rates: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
     """
 
@@ -53,8 +53,8 @@ class CanSimpleFront:
             bank: the drives.
             hubs: the buses.
             nodes: for each bus, the axis (0 .. 11) of each node on it.
-            heartbeat_period_ms: of all axes, if their settings are to have another.
-            dialect: which firmware's CANSimple they speak.
+            heartbeat_period_ms: heartbeat period for all axes; None keeps their settings.
+            dialect: firmware whose CANSimple the drives use.
         """
         self._bank = bank
         self._dialect = DIALECTS[dialect]
@@ -63,7 +63,7 @@ class CanSimpleFront:
         self._next_heartbeat_s = [-math.inf] * N_JOINTS
         self._next_encoder_s = [-math.inf] * N_JOINTS
         self._heartbeat_from_s = -math.inf
-        self._sent = [(-math.inf, 0)] * N_DRIVES  # when heartbeats left last, frames with them
+        self._sent = [(-math.inf, 0)] * N_DRIVES  # time of the last heartbeats, frames with them
         self._crowded = 0
         self._seen = -1
         if heartbeat_period_ms is not None:
@@ -135,14 +135,14 @@ class CanSimpleFront:
         self._heartbeat_from_s = min(due, default=math.inf)
 
     def _count(self, axis: int, now_s: float) -> None:
-        """Count a heartbeat, and an encoder frame that left with it, into the mailboxes."""
+        """Count the mailboxes of a heartbeat and of an encoder frame that left with it."""
         sent_s, frames = self._sent[axis >> 1]
         since_s = now_s - (self._next_encoder_s[axis] - self._encoder_periods_s[axis])
         frames = 1 + (abs(since_s) < _EARLY_S) + (frames if sent_s == now_s else 0)
         self._sent[axis >> 1] = now_s, frames
 
     def _read_periods(self) -> None:
-        """Take the periods from the settings, if these have changed; 0 is never."""
+        """Read the periods from the settings if these have changed; 0 disables a message."""
         settings = self._bank.settings
         if self._seen == settings.version:
             return
@@ -159,7 +159,7 @@ class CanSimpleFront:
                     due_s[axis] = period_s if period_s == math.inf else self._bank.now_s
 
     def _answer(self, bus: _Bus, can_id: int, data: bytes) -> None:
-        """Answer a frame that sets nothing, if it is one that has an answer."""
+        """Answer a frame that sets nothing, if its command has an answer."""
         node, command = cansimple.split_id(can_id)
         axis = bus.nodes.get(node)
         bank = self._bank
@@ -183,10 +183,10 @@ class CanSimpleFront:
             bus.hub.broadcast_packet(pack_frames([(reply_id, reply)]))
 
     def _is_lost(self, axis: int) -> bool:
-        """Return True for an answer that finds all of its drive's three mailboxes full.
+        """Return True if an answer is lost because all three mailboxes of its drive are full.
 
-        So they are while heartbeats and encoder frames of both axes leave, for some three fifths of
-        a millisecond: at 1 kHz 0.6 % of the requests have no answer, and none is repeated.
+        They are full for about 0.6 ms while heartbeats and encoder frames of both axes leave. At
+        1 kHz, 0.6 % of the requests get no answer, and no answer is repeated.
         """
         sent_s, frames = self._sent[axis >> 1]
         if frames < _MAILBOXES or sent_s != self._bank.now_s:
@@ -196,7 +196,7 @@ class CanSimpleFront:
 
 
 def _periods_s(periods_ms: NDArray[np.float64]) -> list[float]:
-    """Return periods in s; 0 ms is never."""
+    """Return periods in s; 0 ms becomes infinite."""
     return [ms * _S_PER_MS if ms > 0.0 else math.inf for ms in periods_ms.tolist()]
 
 
@@ -223,7 +223,7 @@ class _Bus:
 
 
 def _writer(columns: Sequence[str], unpack: Callable[[bytes], Sequence[float]]) -> Setter:
-    """Return how a frame's numbers are written to columns of the bank."""
+    """Return a setter that writes a frame's numbers to columns of the bank."""
 
     def write(bank: AxisBank, axis: int, data: bytes) -> None:
         for column, value in zip(columns, unpack(data), strict=True):
@@ -233,7 +233,7 @@ def _writer(columns: Sequence[str], unpack: Callable[[bytes], Sequence[float]]) 
 
 
 def _set_input_pos(bank: AxisBank, axis: int, data: bytes) -> None:
-    """Write a target; it comes so often that `_writer` would take too long."""
+    """Write a target; this frame is too frequent for the slower `_writer`."""
     pos, vel, torque = cansimple.unpack_input_pos(data)
     bank.input_pos[axis] = pos
     bank.input_vel[axis] = vel

@@ -5,8 +5,8 @@ the firmware's names, measurements, and functions. Units at the motor: turns, tu
 
 `FibreFront` is the protocol of one board, bytes in and bytes out; little-endian throughout.
 
-Request: sequence number, endpoint id (bit 15: an answer is wanted), size of the answer,
-payload, and a trailer that says which table of endpoints the client means. Answer: the
+Request: sequence number, endpoint id (bit 15 requests an answer), size of the answer,
+payload, and a trailer that identifies the client's table of endpoints. Answer: the
 sequence number with bit 15 set, payload.
 
 Source: odriverobotics/ODrive, docs/protocol.rst, Firmware/fibre-cpp and odrive-interface.yaml.
@@ -30,7 +30,7 @@ ANSWER_BYTES: Final = 61
 
 _CRC16_POLYNOMIAL = 0x3D65
 _ANSWER = 0x8000
-_VERSION_ID = 0xFFFF_FFFF  # this "offset" into the JSON asks for its id instead
+_VERSION_ID = 0xFFFF_FFFF  # this "offset" into the JSON requests its id instead
 _HEADER = struct.Struct("<HHH")
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<I")
@@ -89,7 +89,7 @@ class EmulatedBoard(NamedTuple):
 
 
 class Property(NamedTuple):
-    """A value that can be read, and written if `write` is there."""
+    """A value that can be read, and written unless `write` is None."""
 
     name: str
     type: str
@@ -140,7 +140,7 @@ def endpoints() -> list[Endpoint]:
 
 
 def _axis(i: int) -> list[Property | Function]:
-    """Return the endpoints of one axis but for its settings."""
+    """Return the endpoints of one axis, without its settings."""
 
     def shown(name: str, kind: str, value: Callable[[AxisBank, int], Value]) -> Property:
         return Property(name, kind, lambda b: value(b.bank, b.axis(i)))
@@ -234,7 +234,7 @@ def _setting(name: str, default: Value) -> Property:
 
 
 def _set(board: EmulatedBoard, name: str, value: Value) -> None:
-    """Set a setting; a mode goes to the controller, which knows which there are."""
+    """Set a setting; a mode goes to the controller, which checks it."""
     axis, _, below = name.partition(".")
     if below not in _MODES or (below == _INPUT_MODE and value == InputMode.PASSTHROUGH):
         board.bank.settings.set(board.drive, name, value)
@@ -261,8 +261,8 @@ class FibreFront:
 
     Attributes:
         descriptor: the JSON with endpoints and ids, for clients.
-        ignored: packets that are no valid request, which the firmware ignores too, and values that
-            no setting can have.
+        ignored: number of invalid requests, which the firmware ignores too, and of values that no
+            setting accepts.
     """
 
     def __init__(self, board: EmulatedBoard) -> None:
@@ -288,7 +288,7 @@ class FibreFront:
         if sequence & _ANSWER or trailer != (self._crc if number else PROTOCOL_VERSION):
             self.ignored += 1
             return None
-        known = number <= len(self._rows)  # of any other the firmware has nothing to say
+        known = number <= len(self._rows)  # the firmware's answer for any other is empty
         result = self._operate(number, payload)[: min(size, ANSWER_BYTES)] if known else b""
         if not endpoint & _ANSWER:
             return None

@@ -19,7 +19,7 @@ from services.simulator.fronts.unix_can_hub import accept, listen
 PACKET_BYTES: Final = 64
 """A full-speed bulk transfer."""
 CHECK_EVERY: Final = 8
-"""Polls from one check of the plugs to the next: new clients, boards that went silent."""
+"""Polls between two checks of the plugs for new clients and silent boards."""
 
 _PACKETS = 64  # a client that floods the link must not hold up the simulator
 
@@ -28,7 +28,7 @@ class FibrePort:
     """The USB plug of one board.
 
     While the board does not respond (`AxisBank.is_responding`: no power, booting, cable pulled)
-    the plug is out: every client loses the drive, and finds it again when it is back.
+    the plug is out. Every client then loses the drive, and finds it again when it returns.
 
     Raises:
         FleetError: the path cannot be listened on.
@@ -45,7 +45,7 @@ class FibrePort:
 
     @property
     def right(self) -> bool:
-        """True if the plug is in while the board talks, and out while it does not."""
+        """True if the plug matches the board: in while the board responds, else out."""
         return self.front.board.is_responding == (self.listener is not None)
 
     def plug(self) -> None:
@@ -75,7 +75,7 @@ class FibrePort:
                 if reply is not None:
                     client.send(reply)
         except BlockingIOError:
-            pass  # all is answered; or it does not read, and loses its answers as on a real bus
+            pass  # all is answered, or the client does not read and loses answers as on a real bus
         except OSError:
             return False
         return True
@@ -84,7 +84,7 @@ class FibrePort:
 class FibreHub:
     """All USB plugs of one simulator.
 
-    Without a client a poll costs nearly nothing: the plugs have waited for longer.
+    Without a client a poll costs almost nothing: the plugs are checked every `CHECK_EVERY` polls.
     """
 
     def __init__(self, ports: Sequence[FibrePort]) -> None:
@@ -96,15 +96,15 @@ class FibreHub:
 
     @property
     def clients(self) -> int:
-        """How many connections there are, over all drives."""
+        """Number of connections, over all drives."""
         return sum(len(port.clients) for port in self.ports)
 
     def fileno(self) -> int:
-        """Return the descriptor that is readable when there is something for `poll`."""
+        """Return the descriptor that is readable when `poll` has work."""
         return self._epoll.fileno()
 
     def poll(self) -> None:
-        """Answer all requests that have come; now and then look at the plugs. Never waits."""
+        """Answer all received requests, and check the plugs periodically. Never waits."""
         self._polls += 1
         if self._polls % CHECK_EVERY == 0:
             for port in self.ports:
@@ -129,24 +129,24 @@ class FibreHub:
             self._epoll.register(end, select.EPOLLIN)
 
     def _turn_if_wrong(self, port: FibrePort) -> bool:
-        """Put a plug in or pull it, as its board has it; return True if that was to be done."""
+        """Put a plug in or pull it, to match its board; return True if it did not match."""
         if port.right:
             return False
         if port.listener is None:
             port.plug()
             self._watch(port.listener)
         else:
-            port.unplug()  # a closed socket leaves the epoll by itself
+            port.unplug()  # a closed socket leaves the epoll on its own
         return True
 
     def _admit(self, port: FibrePort, listener: socket.socket) -> None:
-        """Admit a client where one has come."""
+        """Admit a waiting client."""
         client = accept(listener)
         if client is not None:
             port.clients[client.fileno()] = client
             self._watch(client)
 
     def _serve(self, port: FibrePort, descriptor: int) -> None:
-        """Answer a client; a board that has gone silent answers nothing more."""
+        """Answer a client, unless its board has gone silent."""
         if not self._turn_if_wrong(port) and not port.serve(port.clients[descriptor]):
             port.clients.pop(descriptor).close()

@@ -18,24 +18,24 @@ from shared.robot import stewart
 
 
 class FrameHub(Protocol):
-    """What a simulated sensor needs of its CAN bus."""
+    """Interface of the CAN bus to a simulated sensor."""
 
     def poll(self) -> object:
-        """Admit new clients and take the frames that they sent; never waits."""
+        """Admit new clients and return the frames that they sent; never waits."""
 
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
         """Send frames (id, data) to every client, as one packet."""
 
 
 BIAS_MAX: Final = 20.0
-"""Zero offset of a load cell: uniform within +- this, N; constant, so that tare matters."""
+"""Maximum zero offset of a load cell, N: uniform within +- this, constant, so tare matters."""
 
 
 class HarnessFront:
     """Six load cells between torso and operator, fixed to the torso."""
 
     def __init__(self, config: RobotConfig, hub: FrameHub, seed: int) -> None:
-        """Draw the zero offsets of this sensor; its seed is the noise's too.
+        """Draw the zero offsets of this sensor; the seed is also that of the noise.
 
         Raises:
             ConfigError: the geometry is singular.
@@ -64,15 +64,15 @@ class HarnessFront:
         forces += self._noise * self._random.standard_normal(stewart.N_LEGS)
         np.maximum(forces, -self._leg_force_max, out=forces)
         np.minimum(forces, self._leg_force_max, out=forces)
-        self._hub.poll()  # a load cell takes no requests, but clients that listen must be admitted
+        self._hub.poll()  # a load cell ignores requests, but clients that listen must be admitted
         self._hub.broadcast(pack_forces(forces.tolist()))
 
 
 class ImuFront:
-    """An IMU on the torso, mounted as the robot file says but for its errors."""
+    """An IMU on the torso, mounted as in the robot file, with the plant's errors."""
 
     def __init__(self, config: ImuConfig, errors: ImuErrors, hub: FrameHub, seed: int) -> None:
-        """Mount the sensor as `config` says, but for the plant's errors."""
+        """Mount the sensor as in `config`, with the plant's errors."""
         self._errors, self._hub = errors, hub
         roll, pitch = errors.tilt
         tilt = _product(_about(0, roll), _about(1, pitch))
@@ -83,7 +83,7 @@ class ImuFront:
         self._random = np.random.default_rng((seed, 1))
 
     def send(self, world: World) -> None:
-        """Send one sample of how the torso stands against gravity, and turns."""
+        """Send one sample of the torso's orientation against gravity and its angular velocity."""
         noise = self._errors.noise * self._random.standard_normal(2)
         turned = _product(world.torso_against_gravity(), self._mounting)
         measured = _product(turned, _product(_about(0, noise[0]), _about(1, noise[1])))

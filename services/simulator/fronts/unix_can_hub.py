@@ -1,4 +1,4 @@
-"""The bus of `shared.can.unix_can` itself: a listening UNIX socket that hands frames on."""
+"""The bus of `shared.can.unix_can`: a listening UNIX socket that forwards frames."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ _ROUNDS = 64  # a client that floods the bus must not hold up the simulator
 _FRAME_BYTES = 16
 _INT = struct.Struct("i")
 TXQUEUELEN: Final = 64
-"""Frames that wait in an interface's queue: what `deploy/udev/92-can.rules` sets."""
+"""Maximum frames in an interface's queue, as set by `deploy/udev/92-can.rules`."""
 
 
 class UnixCanHub:
-    """A CAN bus: hands each client's frames to its owner and to the other clients.
+    """A CAN bus that forwards each client's frames to its owner and to the other clients.
 
     Raises:
         FleetError: the path is in use, too long, or cannot be made.
 
     Attributes:
-        dropped: packets that were not handed on because a client's socket was full.
-        shared: True if nodes are on the bus that its owner does not know of; they acknowledge.
-        acknowledged: False while no node is there: frames wait in the clients' sockets, and reach
-            the bus in order when one is back, or never if the interface is restarted before.
+        dropped: packets that were not forwarded because a client's socket was full.
+        shared: True if the bus has nodes that its owner does not know; they acknowledge frames.
+        acknowledged: False while no node acknowledges. Frames then wait in the clients' sockets.
+            They reach the bus in order when a node returns, unless the interface restarts first.
         choked: True while frames of others fill the send queue: clients' sends fail with ENOBUFS.
     """
 
@@ -57,7 +57,7 @@ class UnixCanHub:
 
     @property
     def clients(self) -> int:
-        """How many clients are on the bus."""
+        """Number of clients on the bus."""
         return len(self._clients)
 
     def poll(self) -> list[Frame]:
@@ -96,7 +96,7 @@ class UnixCanHub:
             self._send(client, packet)
 
     def close(self) -> None:
-        """Leave all clients and remove the socket file, unless another hub has replaced it."""
+        """Disconnect all clients and remove the socket file, unless another hub has replaced it."""
         if self._epoll.closed:
             return
         self._epoll.close()
@@ -124,13 +124,13 @@ class UnixCanHub:
             self._epoll.register(client, select.EPOLLIN)
 
     def _receive(self, client: socket.socket) -> list[Frame]:
-        """Read one packet of a ready client and hand it on; part with a client that has gone."""
+        """Read and forward one packet of a ready client; remove a client that is gone."""
         try:
             packet = client.recv(PACKET_BYTES)
         except BlockingIOError:
             return []
         except ConnectionResetError:
-            return []  # once: it left frames unread; its own frames come next
+            return []  # reported once if it left frames unread; its own frames come next
         except OSError:
             packet = b""
         if not packet:
@@ -143,7 +143,7 @@ class UnixCanHub:
         return unpack_frames(packet)
 
     def _waiting(self) -> int:
-        """Return how many frames clients have sent that no node has acknowledged."""
+        """Return the number of sent frames that no node has acknowledged."""
         waiting = 0
         for client in self._clients.values():
             (size,) = _INT.unpack(fcntl.ioctl(client, termios.FIONREAD, bytes(_INT.size)))
@@ -151,12 +151,12 @@ class UnixCanHub:
         return waiting // _FRAME_BYTES
 
     def _discard(self) -> None:
-        """Throw away what waits."""
+        """Discard the waiting frames."""
         for client in self._clients.values():
             while True:
                 try:
                     if not client.recv(PACKET_BYTES):
-                        break  # it has left; `poll` parts with it
+                        break  # the client is gone; `poll` removes it
                 except OSError:
                     break
 
@@ -205,7 +205,7 @@ def listen(path: Path, what: str) -> socket.socket:
 
 
 def accept(listener: socket.socket) -> socket.socket | None:
-    """Return one client from the queue, if it is still there; it never blocks."""
+    """Return one client from the queue, or None if it is gone; never blocks."""
     try:
         client, _ = listener.accept()
     except OSError:
@@ -215,13 +215,13 @@ def accept(listener: socket.socket) -> socket.socket | None:
 
 
 def _clear_stale(path: Path, what: str) -> None:
-    """Remove a dead socket file; refuse one in use, and a file that is no socket."""
+    """Remove a dead socket file; refuse a socket in use, and a file that is not a socket."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(mode):
-        raise FleetError(f"{what}: {path} is there and is no socket; remove it")
+        raise FleetError(f"{what}: {path} exists and is not a socket; remove it")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
         probe.setblocking(False)
         if probe.connect_ex(str(path)) != errno.ECONNREFUSED:

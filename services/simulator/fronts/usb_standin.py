@@ -1,8 +1,8 @@
 """The USB bus of the emulated drives: a stand-in for libusb-1.0, built and loaded.
 
-The genuine `odrive` package finds the emulated drives when the stand-in takes the place of
-the system's libusb-1.0 and `XRL_USB` names the folder of the plugs (`FOLDER` in the live
-directory): in another process by its environment (`prepare`), in this one by `load`.
+The genuine `odrive` package finds the emulated drives if the stand-in replaces the system's
+libusb-1.0 and `XRL_USB` names the folder of the plugs (`FOLDER` in the live directory). In another
+process its environment does both (`prepare`); in this one `load` loads the stand-in.
 `libusb_standin.c` describes the stand-in.
 """
 
@@ -22,7 +22,7 @@ from shared.run_directory import live_dir
 
 SOURCE: Final = Path(__file__).with_name("libusb_standin.c")
 SONAME: Final = "libusb-1.0.so.0"
-"""As libodrive asks for it."""
+"""Name by which libodrive loads it."""
 FOLDER: Final = "usb"
 """Folder of the plugs in the live directory; a plug's file name is the drive's serial number."""
 VARIABLE: Final = "XRL_USB"
@@ -35,15 +35,15 @@ _COMPILE_S = 60.0
 
 
 def build(folder: Path) -> Path:
-    """Return the stand-in in this folder, compiled if it is not there or older than its source.
+    """Return the stand-in in this folder, compiled if it is missing or older than its source.
 
-    Several processes may do so at once: the library is renamed into place.
+    Several processes may build it at once, because the library is renamed into place.
 
     Raises:
-        FleetError: there is no C compiler, it fails, or the folder cannot be written.
+        FleetError: the C compiler is missing or fails, or the folder cannot be written.
     """
     library = folder / SONAME
-    with suppress(OSError):  # it is not there
+    with suppress(OSError):  # missing
         if library.stat().st_mtime >= SOURCE.stat().st_mtime:
             return library
     try:
@@ -54,7 +54,7 @@ def build(folder: Path) -> Path:
             made.replace(library)
     except OSError as error:
         raise FleetError(
-            f"emulated USB: {folder}: {error.strerror or error}; a folder that can be written"
+            f"emulated USB: {folder}: {error.strerror or error}; use a writable folder"
         ) from error
     return library
 
@@ -62,35 +62,35 @@ def build(folder: Path) -> Path:
 def load(library: Path) -> None:
     """Load the stand-in into this process, before anything imports `odrive`.
 
-    The package's own library then finds a libusb-1.0 there, and looks for no other. `XRL_USB`
-    has to name the folder of the plugs by the time the package is first used.
+    The package's own library then finds this libusb-1.0 and loads no other. `XRL_USB` must name
+    the folder of the plugs before the package is first used.
     """
     ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
 
 
 def prepare(run_dir: Path) -> dict[str, str]:
-    """Return environment variables by which `odrive` in another process finds the drives.
+    """Return environment variables with which `odrive` in another process finds the drives.
 
-    The stand-in is built in the run directory of the fleet whose simulator has them.
+    The stand-in is built in the run directory of the fleet whose simulator has the drives.
     """
     library = build(run_dir / BUILT)
     paths = [str(library.parent), os.environ.get("LD_LIBRARY_PATH", "")]
     return {
         "LD_LIBRARY_PATH": os.pathsep.join(filter(None, paths)),
         VARIABLE: str(live_dir(run_dir) / FOLDER),
-        # where the package keeps drives' descriptors: not those of emulated ones at home
+        # the package caches drives' descriptors here, so emulated ones stay out of the home folder
         "XDG_CACHE_HOME": str(library.parent / "cache"),
     }
 
 
 def clear(run_dir: Path) -> None:
-    """Remove what `prepare` has built, and plugs that a killed simulator has left."""
+    """Remove the build of `prepare`, and plugs left by a killed simulator."""
     shutil.rmtree(run_dir / BUILT, ignore_errors=True)
     folder = live_dir(run_dir) / FOLDER
     for plug in folder.glob("*"):
         if plug.is_socket():
             plug.unlink(missing_ok=True)
-    with suppress(OSError):  # none there, or it holds files of others
+    with suppress(OSError):  # missing, or with other files in it
         folder.rmdir()
 
 
@@ -104,11 +104,11 @@ def _compile(library: Path) -> None:
     except FileNotFoundError:
         wrong = "is not on PATH; install one (Debian, Ubuntu: apt install gcc libc6-dev)"
     except subprocess.TimeoutExpired:
-        wrong = f"was not done with {SOURCE.name} in {_COMPILE_S:g} s"
+        wrong = f"did not finish {SOURCE.name} within {_COMPILE_S:g} s"
     else:
         if not result.returncode:
             return
-        wrong = f"failed on {SOURCE}; C11 with the C library's headers is wanted:\n{result.stderr}"
+        wrong = f"failed on {SOURCE}; it needs C11 and the C library's headers:\n{result.stderr}"
     raise FleetError(
         f'emulated USB: the C compiler `{_COMPILER}` {wrong.strip()}, or use driver = "odrive_can"'
     )

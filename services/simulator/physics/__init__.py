@@ -1,1 +1,1 @@
-"""Bodies, soles, drivetrains and the person: MuJoCo and what surrounds it."""
+"""Physics in and around MuJoCo: bodies, soles, drivetrains and the person."""

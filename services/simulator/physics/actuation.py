@@ -1,14 +1,14 @@
 """From the drives' torques to the joints, and from the joints to the encoders. Pure.
 
-Each of the 12 joint axes has a rotor of its own behind a spring with damping and play:
+Each of the 12 joint axes has its own rotor behind a spring with damping and play:
 
     I w' = tau_motor - tau_spring - d_m w - cogging - dry friction
     tau_spring = k dead(theta - q) + b (w - q')        where the play is taken up
     dead(x) = x - clip(x, -play/2, play/2)
 
-theta, w: the rotor's angle and rate at the joint; both motors of a module are equal, so rotor
-inertia is diagonal in the joints' (phi, theta) too. The joint's share of the damping, b q', is left
-to the body's own integrator, which is implicit in it. The encoders see theta.
+theta and w are the rotor's angle and rate at the joint. Both motors of a module are equal, so the
+rotor inertia is diagonal in the joints' (phi, theta) too. The body's own integrator, which is
+implicit, applies the joint's share of the damping, b q'. The encoders measure theta.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
 
 NOISE_ROWS: Final = 4093
-"""Samples of noise drawn at the start and then repeated: 4 s at 1 kHz, and a prime."""
+"""Number of noise samples, drawn at the start and then repeated: 4 s at 1 kHz, and a prime."""
 
 
 class Actuation:
     """Torque lag and delay, drivetrain and encoders of the 12 axes.
 
     Attributes:
-        flexible: the rotors; None: the joints are the motors.
+        flexible: the rotors; None if the drivetrain is rigid.
         tau_from_motor: joint torques per motor torque (12, 12).
     """
 
     def __init__(self, body: Body, dt: float) -> None:
-        """Take the true robot and the step, s."""
+        """Set the true robot and the step, s."""
         n, plant, turns = N_JOINTS, body.plant, body.motor_from_joint
         drive = plant.drive
         self._turns = turns
@@ -48,9 +48,9 @@ class Actuation:
         self._lags = drive.lag_s > 0.0
         self._follow = 1.0 - math.exp(-dt / drive.lag_s) if self._lags else 1.0
         self._waiting: Array = np.zeros((round(drive.delay_s / dt), n))
-        """Torques on their way, the oldest first."""
+        """Delayed torques, the oldest first."""
         self._tau: Array = np.zeros(n)
-        """Torques of the current loops, where these lag."""
+        """Torques after the lag of the current loops."""
         self._wanted: Array = np.zeros(n)
         self._acting: Array = np.zeros(n)
         flexible = plant.drivetrain.stiffness != RIGID
@@ -62,15 +62,15 @@ class Actuation:
         self._reads = 0
 
     def settle(self, q: Array) -> None:
-        """Be at rest at joint angles q (12,), rad."""
+        """Set the rotors to rest at joint angles q (12,), rad."""
         if self.flexible is not None:
             self.flexible.settle(q)
 
     def torque(self, motor_torque: Array, q: Array, v: Array) -> Array:
-        """Advance by one step; return what acts on the joints (12,), N m.
+        """Advance by one step; return the torques on the joints (12,), N m.
 
-        Of a flexible drivetrain without `flexible.damping` times v. `motor_torque` (12,), N m, is
-        what the drives want.
+        With a flexible drivetrain they exclude `flexible.damping` times v. `motor_torque` (12,),
+        N m, is the drives' command.
         """
         wanted = np.matmul(self.tau_from_motor, motor_torque, out=self._wanted)
         if len(self._waiting):
@@ -79,7 +79,7 @@ class Actuation:
             self._waiting[-1] = wanted
             wanted[:] = late
         acting = self._acting
-        if self._lags:  # at the step's begin: positions are then right to second order in dt
+        if self._lags:  # as at the step's start, so positions are right to second order in dt
             acting[:] = self._tau
             wanted -= self._tau
             wanted *= self._follow
@@ -91,7 +91,7 @@ class Actuation:
     def encoders(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the encoders' motor angles (12,), turns, and the true rates, turn/s.
 
-        From angles and rates of the rotors (12,), rad and rad/s at the joints.
+        q and v are angles and rates of the rotors (12,), rad and rad/s at the joints.
         """
         turns = self._turns @ q
         turns += self._offset
@@ -100,12 +100,12 @@ class Actuation:
         return turns, self._turns @ v
 
     def numbers(self) -> list[float]:
-        """Return all that changes from step to step, one number after the other."""
+        """Return the state that changes between steps as one list."""
         columns = (column.ravel() for column in self._columns())
         return [float(self._reads), *np.concatenate([*columns]).tolist()]
 
     def set_numbers(self, numbers: Sequence[float]) -> None:
-        """Continue from what `numbers` returned of the same plant."""
+        """Restore the state that `numbers` returned for the same plant."""
         self._reads, rest = int(numbers[0]), np.array(numbers[1:])
         for column in self._columns():
             column[:] = rest[: column.size].reshape(column.shape)
@@ -122,25 +122,25 @@ class FlexibleDrivetrain:
     Attributes:
         theta: rotor angles at the joint (12,), rad.
         rate: rad/s.
-        damping: of the spring on the joint in this step (12,), N m s/rad: 0 within the play.
+        damping: the spring's damping on the joint in this step (12,), N m s/rad: 0 in the play.
     """
 
     def __init__(self, config: Drivetrain, motor_from_joint: Array, dt: float) -> None:
-        """Take finite stiffness, motor turns per joint angle (12, 12), and the step dt, s."""
+        """Set a finite stiffness, motor turns per joint angle (12, 12), and the step dt, s."""
         self._graph = CompiledGraph(step_graph(config, motor_from_joint, dt))
         self.theta, self.rate, *self._arguments = self._graph.arguments
         self._theta_next, self._rate_next, self._tau, self.damping = self._graph.results
 
     def settle(self, q: Array) -> None:
-        """Put the rotors where the joints (12,), rad, are, at rest."""
+        """Put the rotors to rest at joint angles (12,), rad."""
         self.theta[:] = q
         self.rate[:] = 0.0
 
     def step(self, tau_motor: Array, q: Array, v: Array) -> Array:
         """Advance the rotors by one step; return the springs' torques on the joints (12,), N m.
 
-        `damping` times v is left to the body's integrator. The next call overwrites the result.
-        Motor torques (12,), N m, are those at the joints.
+        The body's integrator adds `damping` times v. The next call overwrites the result. Motor
+        torques (12,), N m, are those at the joints.
         """
         tau_now, q_now, v_now = self._arguments
         tau_now[:], q_now[:], v_now[:] = tau_motor, q, v

@@ -1,8 +1,8 @@
 """The true robot: the robot file with the plant's errors applied, put on its feet.
 
-The world steps this and holds no robot file, so a controller's model and the truth can differ in
-every number. The generated model (`shared.robot.robot_model`) is the nominal one; masses, friction,
-floor and feet are changed on it here.
+The world steps this body and has no robot file, so a controller's model and the truth can differ in
+every number. The generated model (`shared.robot.robot_model`) is nominal; this module changes its
+masses, friction, floor and feet.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ else:
     mujoco = late("mujoco")
 
 MINOR_FRICTION = (0.005, 0.0001)
-"""m; of a contact's torsion and rolling."""
+"""m; torsional and rolling friction of a contact."""
 STICTION_TIME = 0.004
-"""Time constant of the friction between sole and floor, s: twice the least at a 1 ms step.
+"""Time constant of the friction between sole and floor, s: twice the minimum at a 1 ms step.
 
-MuJoCo leaves the term dJ/dt v out of a contact's acceleration. A sole under a turning leg therefore
-creeps, by the leg's centripetal acceleration times about half of this time. With the contact's own
-20 ms the feet crept back by 1.9 mm a squat, at any time step and `impratio`; now by 0.3 mm. So
-`SimTruth.over` is measured from where the feet are.
+MuJoCo omits the term dJ/dt v from a contact's acceleration. A sole under a turning leg therefore
+creeps by the leg's centripetal acceleration times about half of this time. With the contact's own
+20 ms the feet crept back by 1.9 mm per squat, at any time step and `impratio`; with 4 ms, by 0.3
+mm. `SimTruth.over` is therefore measured from the feet's present position.
 """
 
 
@@ -43,17 +43,17 @@ ITERATIONS: Final = 8
 
 
 class Body(NamedTuple):
-    """The true robot and what stands behind its harness."""
+    """The true robot and the operator behind its harness."""
 
     model: mujoco.MjModel
     timestep: float
-    """Duration of one call of `World.step`, s; the model's own is a `plant.steps`th of it."""
+    """Duration of one `World.step`, s; the model's own step is this divided by `plant.steps`."""
     weight: float
     """N"""
     stand_q: Array
-    """(12,) rad, close to the stand at the start."""
+    """Joint angles near the initial stand (12,), rad."""
     ankles: Array
-    """(2, 3) m, right and left, where they stand."""
+    """Positions of the right and left ankle (2, 3), m."""
     foot_yaws: tuple[float, float]
     """rad"""
     harness_point: Vector3
@@ -67,10 +67,10 @@ class Body(NamedTuple):
 
 
 def body_of(config: RobotConfig, plant: PlantConfig) -> Body:
-    """Return the true robot: as its controllers know it, but for the plant."""
+    """Return the true robot: the controllers' model with the plant's errors."""
     spec = mujoco.MjSpec.from_string(mjcf(config))
     spec.option.timestep = config.simulation.timestep / plant.steps
-    # By itself MuJoCo takes sparse matrices from 60 degrees of freedom on, and the sparse Newton
+    # By default MuJoCo uses sparse matrices from 60 degrees of freedom on, and the sparse Newton
     # solver of 4.0.0 is wrong by up to 22 % on some trees (200 iterations, no warning).
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     _set_gravity(spec, plant)
@@ -127,9 +127,9 @@ def _set_joints(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
 
 
 def _feet(config: RobotConfig, plant: PlantConfig) -> tuple[Array, tuple[float, float]]:
-    """Return the ankles (2, 3), m, and how the feet are turned, rad.
+    """Return the positions of the ankles (2, 3), m, and the yaws of the feet, rad.
 
-    The world is midway between them in x and y, and on the left one's floor.
+    The origin is midway between them in x and y, and at the left foot's height.
     """
     ankles = np.array(ankle_positions(config))
     half = 0.5 * (np.array(plant.feet.offset_right) - np.array(plant.feet.offset_left))
@@ -181,17 +181,17 @@ def _motor_from_joint(gear_ratio: float) -> Array:
 
 
 class FootPlacement:
-    """Solves the legs' joint angles, and knows where the feet stand.
+    """Places of the feet, and the solver of the legs' joint angles there.
 
     Attributes:
-        q_index: places of the 12 joint angles in MuJoCo's qpos.
-        v_index: places of their rates in qvel.
+        q_index: indices of the 12 joint angles in MuJoCo's qpos.
+        v_index: indices of their rates in qvel.
         feet: MuJoCo's ids of the feet, by side.
-        ankles: where the feet were placed (2, 3), m; slip is measured from here.
+        ankles: initial positions of the feet (2, 3), m; slip is measured from them.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, body: Body) -> None:
-        """Take MuJoCo's model and data, and the places of the feet."""
+        """Set MuJoCo's model and data, and the places of the feet."""
         self._model, self._data = model, data
         joints = [model.joint(name) for name in JOINTS]
         self.q_index = np.array([joint.qposadr[0] for joint in joints])
@@ -201,9 +201,9 @@ class FootPlacement:
         self.ankles: Array = np.array(body.ankles)
 
     def stand_up(self, q: Array, lean: tuple[float, float]) -> None:
-        """Place the robot with the torso along the floor and the COM over the ankles by gravity.
+        """Place the robot, torso square to the floor, with the COM vertically above the ankles.
 
-        It starts from joint angles q (12,), rad; `lean` is gravity's x and y over its z.
+        The solver starts from joint angles q (12,), rad; `lean` is gravity's x and y over its z.
         """
         data, model = self._data, self._model
         data.qpos[self.q_index] = q
@@ -212,7 +212,7 @@ class FootPlacement:
         self._flatten_soles()
         level = data.subtree_com[0][:2].copy()
         for _ in range(ITERATIONS if any(lean) else 0):
-            com = data.subtree_com[0]  # the legs go less far than the torso
+            com = data.subtree_com[0]  # the legs move less than the torso
             data.qpos[:2] += level + np.array(lean) * com[2] - com[:2]
             self._flatten_soles()
 
@@ -249,7 +249,7 @@ class FootPlacement:
 
 
 def _without_yaw(rotation: Array, yaw: float) -> Array:
-    """Return Rz(yaw)^T rotation: the foot's small rotation against its place."""
+    """Return Rz(yaw)^T rotation: the foot's small rotation from its place."""
     if yaw == 0.0:
         return rotation
     c, s = math.cos(yaw), math.sin(yaw)

@@ -1,7 +1,7 @@
 """The simulated operator: a hand that leads or is led, and weight rested on the harness.
 
 The hand is a clipped spring-damper between a path and the harness point, in height and
-pitch (docs/simulator.md#reference-scenario), and sideways where a scenario says so. Behind it is a
+pitch (docs/simulator.md#reference-scenario), and sideways if the scenario says so. Behind it is a
 person with a mass, which yields in height. Pure.
 """
 
@@ -20,31 +20,31 @@ from shared.config.scenarios import Act, Lead
 from shared.config.sections import OperatorConfig
 
 BANDWIDTH: Final = 8.0
-"""rad/s, of the critically damped system with which the hand follows what is asked for."""
+"""rad/s; bandwidth of the critically damped system with which the hand follows requests."""
 HEIGHT_MAX_RATE: Final = 0.25
-"""m/s: the hand then pulls with up to 70 N; at 0.5 m/s with 150 N, where the planner lets go."""
+"""m/s; the hand then pulls with up to 70 N. At 0.5 m/s it is 150 N, where the planner lets go."""
 PITCH_MAX_RATE: Final = 1.0
 """rad/s"""
 HEIGHTS: Final = (0.78, 1.2)
-"""Range of the torso's height, m: within what the legs reach."""
+"""Range of the torso's height, m, within the legs' reach."""
 PITCHES: Final = (-0.3, 0.9)
 """Range of the torso's pitch, rad."""
 PUSH_MAX: Final = 120.0
 """N, in each direction."""
 PUSH_EXPIRES_S: Final = 0.3
-"""After the last message: somebody who is gone does not go on pushing."""
+"""Timeout of a push after its last message, s."""
 
 
 class LedHand(msgspec.Struct):
-    """The hand as somebody leads it in place of the scenario, within limits and without jumps.
+    """Hand that somebody leads instead of the scenario, within limits and without jumps.
 
-    Follows what is asked for; without a new request it stays where it was led, and its push ends.
+    It follows the requests. Without a new request it stays in place, and its push ends.
 
     Its fields, in this order, are `SimState.hand`.
     """
 
     leads: bool = False
-    """Somebody leads; False: somebody pushes only, and the scenario leads."""
+    """True if requests lead the hand; False if they only push, and the scenario leads."""
     height: float = 0.0
     height_rate: float = 0.0
     pitch: float = 0.0
@@ -56,10 +56,10 @@ class LedHand(msgspec.Struct):
     force_z: float = 0.0
     push_left_s: float = 0.0
 
-    def ask(self, asked: HandLead, now: Lead) -> None:
+    def request(self, asked: HandLead, now: Lead) -> None:
         """Accept a request, within the limits; a value that is not finite is ignored.
 
-        The first one takes over from where the hand is led `now`.
+        The first request takes over from the scenario's lead `now`.
         """
         if not all(map(math.isfinite, (asked.height, asked.pitch, *asked.push))):
             return
@@ -103,13 +103,13 @@ class LedHand(msgspec.Struct):
 
     @classmethod
     def of_numbers(cls, numbers: Sequence[float]) -> LedHand:
-        """Return the hand that `numbers` were of."""
+        """Return the hand with these `numbers`."""
         leads, *rest = numbers
         return cls(leads > 0.0, *rest)
 
     @property
     def push(self) -> Vector3 | None:
-        """Push on the torso, N, world; None: the scenario's own."""
+        """Push on the torso, N, world; None if the scenario pushes."""
         if self.push_left_s <= 0.0:
             return None
         return (self.force_x, self.force_y, self.force_z)
@@ -118,10 +118,10 @@ class LedHand(msgspec.Struct):
 def follow(
     wanted: float, at: float, rate: float, rate_max: float, dt: float
 ) -> tuple[float, float]:
-    """Return place and rate of a coordinate dt s later, on its way to where it is wanted.
+    """Return position and rate of a coordinate dt s later, as it follows its target.
 
-    A critically damped second-order system with a limit on its rate; in closed form, so it is
-    stable whatever dt is.
+    The follower is a critically damped second-order system with a rate limit. It is in closed form,
+    so it is stable for any dt.
     """
     # x'' = w^2 (wanted - x) - 2 w x', whose error is (a + b t) exp(-w t)
     error, w = at - wanted, BANDWIDTH
@@ -145,16 +145,16 @@ class HandForce(NamedTuple):
 
 
 class Acting(NamedTuple):
-    """What the person does now beside leading."""
+    """Actions of the person besides leading."""
 
     load: float = 0.0
-    """Weight on the harness that nobody asked for, N."""
+    """Weight on the harness beyond the requested assist, N."""
     up: float = 0.0
     """Force of bumps and tremor, N, up."""
     ahead: float = 0.0
     """Force along world x, N."""
     grip: float = 1.0
-    """Part of its strength with which the hand holds."""
+    """Fraction of the hand's full grip."""
 
 
 NO_ACT: Final = Acting()
@@ -165,7 +165,7 @@ _GRIPS: Final = {"relax": RELAXED, "limp": 0.0, "let_go": 0.0}
 
 
 def acting(acts: Sequence[Act], t: float) -> Acting:
-    """Return what a person does at scenario time t, s."""
+    """Return the person's actions at scenario time t, s."""
     load = up = ahead = 0.0
     grip = 1.0
     for act in acts:
@@ -190,14 +190,14 @@ def acting(acts: Sequence[Act], t: float) -> Acting:
 
 
 REACH_S: Final = 0.4
-"""Time constant with which a hand that grips the robot joins the path."""
+"""Time constant with which a hand that grips the robot joins the path, s."""
 
 
 class Wearer(msgspec.Struct):
     """The person's own mass behind the hand, which yields to the robot's force.
 
-    It grips the robot where that is and joins the path. From then on d is its height above the
-    path:  m d'' = -m w^2 d - 2 zeta m w d' - f. Without a mass it follows the path exactly.
+    It grips the robot in place and then joins the path. d is its height above the path:
+    m d'' = -m w^2 d - 2 zeta m w d' - f. Without a mass it follows the path exactly.
     """
 
     person: Person
@@ -206,11 +206,11 @@ class Wearer(msgspec.Struct):
     rate: float = 0.0
     """m/s"""
     load_n: float = 0.0
-    """What rests on the harness, N."""
+    """Weight on the harness, N."""
     asked_n: float = 0.0
-    """The part of it that was asked for."""
+    """Part of that weight within the requested assist, N."""
     reach: float = 0.0
-    """m, the path is so far off still, since it took hold: gone before a scenario starts."""
+    """Remaining distance to the path since the grip, m; it decays before a scenario starts."""
     holds: bool = False
 
     def grip(self, above: float) -> None:
@@ -219,14 +219,14 @@ class Wearer(msgspec.Struct):
             self.holds, self.reach = True, above
 
     def motion(self) -> tuple[float, float]:
-        """Return how far the hand is above its path, m, and its rate, m/s."""
+        """Return the hand's height above its path, m, and its rate, m/s."""
         return self.above + self.reach, self.rate - self.reach / REACH_S
 
     def step(self, dt: float, force_on_robot: float, assist: float, load: float = 0.0) -> None:
         """Advance by dt, s, under the hand's force on the robot, N, up.
 
-        Of the assist that it requests, N, the person rests a part, with a delay; a load that it
-        asks nobody for comes on top.
+        The person rests a fraction of the requested assist, N, on the harness, with a lag. An
+        unrequested `load`, N, is added.
         """
         person = self.person
         if person.mass > 0.0:
@@ -245,16 +245,16 @@ class Operator:
     """The hand's spring-damper."""
 
     def __init__(self, hand: OperatorConfig, harness_point: Vector3) -> None:
-        """Take the spring-damper and where on the torso it acts, m, torso axes."""
+        """Set the spring-damper and its point on the torso, m, torso axes."""
         self._hand = hand
         self._point = harness_point
 
     def force(
         self, wanted: Lead, height: float, rate: float, pitch: float, pitch_rate: float
     ) -> HandForce:
-        """Return the hand's force, from where it leads and where the robot is.
+        """Return the hand's force, from the wanted and the actual pose.
 
-        `height` is the harness point's above the ankles, m, `pitch` the torso's, rad.
+        `height` is that of the harness point above the ankles, m; `pitch` is the torso's, rad.
         """
         x, _, z = self._point
         sine, cosine = math.sin(wanted.pitch), math.cos(wanted.pitch)
@@ -274,7 +274,7 @@ class Operator:
         )
 
     def force_side(self, wanted: Lead, side: float, rate: float) -> float:
-        """Return the hand's force along world y, N; 0 where nothing holds it sideways.
+        """Return the hand's force along world y, N; 0 if the scenario leads no side.
 
         The harness point is at `side`, m, and moves at `rate`, m/s.
         """

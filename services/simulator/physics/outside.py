@@ -1,4 +1,4 @@
-"""What acts on the simulated torso from outside: the hand, what rests on it, pushes, the hoist."""
+"""External forces on the simulated torso: the hand, the rested weight, pushes and the hoist."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ HOIST_STIFFNESS: Final = (2e4, 2e3)
 HOIST_DAMPING: Final = (2e3, 2e2)
 """N s/m and N m s/rad."""
 HOIST_WEIGHT_SHARE: Final = 0.75
-"""Part of the weight the hoist takes: the soles stay on the floor."""
+"""Fraction of the weight that the hoist carries; the soles stay on the floor."""
 
 
 class Torso(NamedTuple):
-    """The torso in MuJoCo's memory: views, because asking it for an array costs a microsecond."""
+    """Views of the torso in MuJoCo's memory, because querying an array costs a microsecond."""
 
     position: Array
     """(3,) m, world."""
     rotation: Array
-    """(9,), row by row: turns torso axes into the world's."""
+    """(9,), row by row; turns torso axes into world axes."""
     rates: Array
     """(6,) velocity in world axes and angular velocity in torso axes."""
     wrench: Array
@@ -45,20 +45,20 @@ class Torso(NamedTuple):
 
 
 class _Hoist(msgspec.Struct):
-    """A spring-damper on the torso that also carries weight, by a share that is let down."""
+    """Spring-damper on the torso that also carries weight, and fades out on release."""
 
     weight: float
-    """The robot's, N."""
+    """Weight of the robot, N."""
     release_s: float
-    """Time in which it lets go, s."""
+    """Duration of the release, s."""
     position: Array
-    """Where it holds the torso, (3,) m, world."""
+    """Position at which the torso is held (3,), m, world."""
     share: float = 1.0
-    """Fraction of its support: 1 hanging, 0 free."""
+    """Fraction of the support: 1 hanging, 0 free."""
     releasing: bool = False
 
     def advance(self, torso: Torso, dt: float) -> Array:
-        """Let down further; return force and moment on the torso (6,), N and N m, world."""
+        """Advance the release; return force and moment on the torso (6,), N and N m, world."""
         if self.releasing:
             self.share = max(0.0, self.share - dt / self.release_s)
         k_lin, k_ang = HOIST_STIFFNESS
@@ -87,20 +87,20 @@ class OutsideForces:
     """The operator, pushes and the hoist.
 
     Attributes:
-        operator: the hand's spring-damper; another one may take its place.
-        asked: assist, N, and shift that somebody asks for in place of the scenario.
-        led_hand: the hand that somebody leads in place of the scenario.
+        operator: the hand's spring-damper; may be replaced.
+        asked: assist, N, and shift that another operator requests instead of the scenario.
+        led_hand: the hand that somebody leads instead of the scenario.
         holds: the operator's hand is on the harness.
-        hand: the hand's force now.
+        hand: the hand's present force.
         hand_side: the hand's force along world y, N.
         hand_ahead: the person's force along world x, N.
-        push: the push now, N, world.
+        push: the present push, N, world.
         harness_force: the operator's force on the torso at the harness point, N, torso axes.
         harness_moment: N m, torso axes.
     """
 
     def __init__(self, body: Body, scenario: Scenario, torso: Torso) -> None:
-        """Hold the torso by the hoist where it is."""
+        """Hold the torso by the hoist at its present position."""
         self.scenario = scenario
         self._torso = torso
         self._harness_point = body.harness_point
@@ -128,7 +128,7 @@ class OutsideForces:
     def apply(self, scenario_s: float, dt: float) -> None:
         """Advance by dt, s, and set the wrench on the torso.
 
-        In plain numbers: this runs at every step, and numpy's calls on three numbers
+        It uses plain floats, because it runs at every step and NumPy's calls on three numbers
         would cost more than the physics.
         """
         torso, led_hand = self._torso, self.led_hand
@@ -177,7 +177,7 @@ class OutsideForces:
         f, m = self.hand.force_z - self.wearer.load_n, self.hand.moment_pitch
         ahead = now.ahead
         self.hand_side, self.hand_ahead = side, ahead
-        # in torso axes, as the sensor feels it, and m about torso y
+        # in torso axes, as the sensor measures it, and m about torso y
         self.harness_force = (
             r[0] * ahead + r[3] * side + r[6] * f,
             r[1] * ahead + r[4] * side + r[7] * f,

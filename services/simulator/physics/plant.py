@@ -33,20 +33,20 @@ RIGID: Final = math.inf
 
 
 class Drivetrain(Section, frozen=True):
-    """Between motor and joint, each of the 12 axes alike; the encoder is at the motor."""
+    """Drivetrain from motor to joint, the same on all 12 axes; the encoder is at the motor."""
 
     stiffness: Annotated[float, Range(500.0, math.inf, "N m/rad")] = 8000.0
-    """Stiffness of gear and chain, seen at the joint; inf: rigid. Harmonic drives of this torque
-    class have 10 000 to 30 000 N m/rad by their catalogues, a chain stage after it a half to a
-    fifth."""
+    """Stiffness of gear and chain, seen at the joint; inf is rigid. Catalogues give harmonic drives
+    of this torque class 10 000 to 30 000 N m/rad; with a chain stage, a half to a fifth of that
+    remains."""
     damping_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.002
     """Damping as a time: N m s/rad per N m/rad. Steel in grease has a loss factor of 1 to 5 %; at
     the drivetrain's 37 Hz (8000 N m/rad on the rotor) 0.002 s is a damping ratio of 0.23 against
     the rotor alone, chain and bearings included."""
     play: Annotated[float, Range(0.0, 0.1, "rad")] = math.radians(0.1)
-    """Backlash, from stop to stop: a tensioned chain with a sprocket of 0.1 m and 0.2 mm."""
+    """Backlash, from stop to stop: 0.2 mm of a tensioned chain on a sprocket of 0.1 m."""
     rotor_inertia: Annotated[float, Range(0.01, 5.0, "kg m^2")] = 0.15
-    """At the joint: rotors through the gear, as `joint.armature` of the robot file."""
+    """Inertia of the rotors through the gear, at the joint, as `joint.armature`."""
     motor_friction: Annotated[float, Range(0.0, 20.0, "N m")] = 0.2
     """Dry friction on the motor's side, at the joint."""
     joint_friction: Annotated[float, Range(0.0, 20.0, "N m")] = 0.1
@@ -54,20 +54,20 @@ class Drivetrain(Section, frozen=True):
     motor_damping: Annotated[float, Range(0.0, 50.0, "N m s/rad")] = 0.3
     joint_damping: Annotated[float, Range(0.0, 50.0, "N m s/rad")] = 0.2
     cogging: Annotated[float, Range(0.0, 5.0, "N m")] = 0.2
-    """Amplitude at the joint, of each motor: 0.01 N m of an outrunner through a gear of 17.5."""
+    """Amplitude per motor, at the joint: 0.01 N m of an outrunner through a gear of 17.5."""
     cogging_periods: Annotated[int, Range(1, 1000, "1")] = 42
-    """In one turn of the motor: least common multiple of slots and poles of a small outrunner."""
+    """Periods per motor turn: least common multiple of slots and poles of a small outrunner."""
 
 
 class DriveErrors(Section, frozen=True):
-    """From the torque that a drive wants to the one that acts."""
+    """Errors between a drive's commanded torque and the actual one."""
 
     lag_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.001
     """First-order lag: the current loop's bandwidth of 1000 rad/s (ODrive's default)."""
     delay_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.0
-    """Pure delay besides; the frames' own delay is the bus's."""
+    """Additional pure delay; the bus adds the delay of the frames."""
     torque_scale: Scale = 1.0
-    """Actual over wanted torque: a wrong torque constant."""
+    """Actual over commanded torque, as with a wrong torque constant."""
 
 
 class EncoderErrors(Section, frozen=True):
@@ -76,22 +76,22 @@ class EncoderErrors(Section, frozen=True):
     noise_counts: Annotated[float, Range(0.0, 100.0, "counts")] = 0.5
     """Standard deviation; a capacitive encoder of 16384 counts moves by one count at rest."""
     zero_errors: tuple[Angle, ...] = (0.0,) * N_JOINTS
-    """Reported less true angle, each of the 12 joints, rad."""
+    """Reported minus true angle of each of the 12 joints, rad."""
 
 
 class ImuErrors(Section, frozen=True):
-    """Errors of the IMU, where one is fitted."""
+    """Errors of the IMU, if one is fitted."""
 
     tilt: tuple[Angle, Angle] = (0.005, -0.005)
-    """Roll and pitch, reported less true, rad: the sensor's error (0.2 to 0.5 degrees of an MTi
-    630) and its mounting's.
+    """Reported minus true roll and pitch, rad: error of the sensor (0.2 to 0.5 degrees for an MTi
+    630) and of its mounting.
     """
     noise: Annotated[float, Range(0.0, 0.1, "rad")] = 0.001
     """Standard deviation about each axis."""
 
 
 class BodyErrors(Section, frozen=True):
-    """Masses and their places against the robot file's."""
+    """Errors of the masses and their positions in the robot file."""
 
     payload_scale: Annotated[float, Range(0.0, 3.0, "1")] = 1.0
     mass_scale: Scale = 1.0
@@ -114,9 +114,9 @@ class Floor(Section, frozen=True):
 
 
 class Feet(Section, frozen=True):
-    """Where the feet are put, against where the robot file has them.
+    """Offsets of the feet from their places in the robot file.
 
-    Only the one against the other matters: the world's origin is midway between the ankles.
+    Only their difference matters, because the world's origin is midway between the ankles.
     """
 
     offset_right: tuple[Shift, Shift, Angle] = (0.0, 0.0, 0.0)
@@ -128,7 +128,7 @@ class Person(Section, frozen=True):
     """The person behind the hand: a mass on legs that follows the scenario's path."""
 
     mass: Annotated[float, Range(0.0, 200.0, "kg")] = 80.0
-    """0: the hand follows the path exactly, whatever it meets."""
+    """With 0 the hand follows the path exactly, whatever the force."""
     leg_frequency_hz: Annotated[float, Range(0.5, 20.0, "Hz")] = 2.5
     """Frequency of the person's mass on its legs: a standing person bounces at 2 to 3 Hz
     (whole-body vibration)."""
@@ -152,7 +152,7 @@ class PlantConfig(Section, frozen=True):
     person: Person = Person()
     heat: Heat = Heat()
     steps: Annotated[int, Range(1, 64, "1")] = 1
-    """Steps of world and drivetrain in a `simulation.timestep`: more show whether one is enough."""
+    """Steps of world and drivetrain per `simulation.timestep`; more show whether 1 is enough."""
     seed: Annotated[int, Range(0, 1 << 31, "1")] = 0
     """Seed of the encoders' noise."""
 
@@ -165,24 +165,24 @@ IDEAL: Final = PlantConfig(
     floor=Floor(friction=0.9),
     person=Person(mass=0.0, load_scale=1.0, load_lag_s=0.0),
 )
-"""The controllers' own model: proves that the code follows the equations, nothing more."""
+"""The controllers' own model, which shows only that the code follows the equations."""
 
 NAMED: Final[Mapping[str, PlantConfig]] = {"realistic": PlantConfig(), "ideal": IDEAL}
 
 
 def load(path: Path) -> PlantConfig:
-    """Read a plant file; a key that it lacks keeps its default."""
+    """Read a plant file; a missing key keeps its default."""
     plant = read_toml(path, PlantConfig)
     _check(str(path), plant)
     return plant
 
 
 def plant_from(words: Iterable[str]) -> PlantConfig:
-    """Return the plant that `--plant` asks for.
+    """Return the plant for the arguments of `--plant`.
 
     Args:
-        words: each a name (`ideal`), a file, or KEY=VALUE such as `drivetrain.play=0.01`; each is
-            laid over those before it.
+        words: names (`ideal`), files, or KEY=VALUE such as `drivetrain.play=0.01`, in order. A name
+            or file replaces all earlier words; KEY=VALUE changes one value.
     """
     plant = PlantConfig()
     for word in words:
@@ -194,8 +194,8 @@ def plant_from(words: Iterable[str]) -> PlantConfig:
         elif word.endswith(".toml"):
             plant = load(Path(word))
         else:
-            right = f"one of {', '.join(NAMED)}, a .toml file, or KEY=VALUE"
-            raise ConfigError("--plant", "(name)", f"{word!r}", right)
+            right = f"use one of {', '.join(NAMED)}, a .toml file, or KEY=VALUE"
+            raise ConfigError("--plant", "(name)", f"{word!r} is not a plant", right)
     return plant
 
 
@@ -208,7 +208,7 @@ def changed(plant: PlantConfig, values: Mapping[str, Any]) -> PlantConfig:
         if not isinstance(target, dict) or name not in target:
             sections = {name: rows for name, rows in table.items() if isinstance(rows, dict)}
             known = [f"{section}.{name}" for section, rows in sections.items() for name in rows]
-            raise ConfigError("--plant", key, "unknown key", f"one of {', '.join(known)}")
+            raise ConfigError("--plant", key, "unknown key", f"use one of {', '.join(known)}")
         is_text = isinstance(value, str)
         target[name] = (
             parse_toml(f"value = {value}", f"--plant {key}", _Any).value if is_text else value
@@ -230,4 +230,6 @@ class _Any(Section, frozen=True):
 def _check(file: str, plant: PlantConfig) -> None:
     found = len(plant.encoder.zero_errors)
     if found != N_JOINTS:
-        raise ConfigError(file, "encoder.zero_errors", f"{found} values", f"{N_JOINTS}, in rad")
+        raise ConfigError(
+            file, "encoder.zero_errors", f"{found} values", f"must be {N_JOINTS}, in rad"
+        )

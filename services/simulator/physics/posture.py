@@ -1,4 +1,4 @@
-"""Measures how the simulated robot stands, what its soles bear, and whether it has fallen."""
+"""Posture of the simulated robot, loads of its soles, and whether it has fallen."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FALLEN_ANGLE: Final = 0.6
 FALLEN_TILT: Final = 0.6
 """rad of a sole against the floor."""
 LEAST_N: Final = 1e-3
-"""A sole that bears less has no centre of pressure."""
+"""N; a sole with a smaller load has no centre of pressure."""
 
 
 class _MeasuredPosture(NamedTuple):
@@ -42,7 +42,7 @@ class _MeasuredPosture(NamedTuple):
     slip: float
     """Largest distance of a foot from its place, m."""
     feet: Pair
-    """Mean distance of the two from their places, x and y, m."""
+    """Mean offset of both feet from their places, x and y, m."""
 
     @property
     def fallen(self) -> bool:
@@ -57,16 +57,16 @@ class _MeasuredPosture(NamedTuple):
 
 
 class SoleLoad(NamedTuple):
-    """What the floor does to one sole."""
+    """Floor's force on one sole."""
 
     force: Vector3
     """N, world."""
     cop: Pair
-    """Centre of pressure, x and y, m, world; (0, 0) if it bears nothing."""
+    """Centre of pressure, x and y, m, world; (0, 0) without a load."""
 
 
 def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -> _MeasuredPosture:
-    """Return the posture after a step; `ankles` (2, 3), m, is where the feet were placed."""
+    """Return the posture after a step; `ankles` (2, 3), m, are the initial places of the feet."""
     rotation = data.xmat[torso].reshape(3, 3)
     roll = math.asin(clamp(rotation[2, 1], -1.0, 1.0))
     pitch = math.atan2(-rotation[2, 0], rotation[2, 2])

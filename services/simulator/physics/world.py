@@ -1,7 +1,7 @@
-"""The physical world in MuJoCo: the robot on free feet, and what acts on it.
+"""The physical world in MuJoCo: the robot on free feet, and the forces on it.
 
-Steps the true robot (`services.simulator.physics.body`), and knows no robot file, bus or clock:
-`step` takes motor torques and moves on by one time step.
+It steps the true robot (`services.simulator.physics.body`) without a robot file, bus or clock:
+`step` takes motor torques and advances by one time step.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ else:
 
 
 class Joints(NamedTuple):
-    """The 12 joints in MuJoCo's memory: views, because asking it costs a microsecond."""
+    """Views of the 12 joints in MuJoCo's memory, because each query costs a microsecond."""
 
     q_index: NDArray[np.intp]
-    """Places of the joint angles in qpos."""
+    """Indices of the joint angles in qpos."""
     v_index: NDArray[np.intp]
-    """Places of their rates in qvel."""
+    """Indices of the joint rates in qvel."""
     qpos: Array
     qvel: Array
     applied: Array
-    """Torques by place of the rate, N m."""
+    """Applied torques, indexed by `v_index`, N m."""
     damping: Array
-    """By place of the rate, N m s/rad."""
+    """Damping, indexed by `v_index`, N m s/rad."""
     damping_alone: Array
     """Damping of the joints without their drivetrains (12,), N m s/rad."""
 
 
 class World:
-    """The simulated robot and what acts on it.
+    """The simulated robot and the forces on it.
 
     Attributes:
-        outside: what acts on the torso.
+        outside: external forces on the torso.
         joints: the joints in MuJoCo's memory.
         actuation: drivetrains and encoders.
-        placement: where the feet stand.
-        time: s since the world began.
+        placement: positions of the feet.
+        time: time since the start of the world, s.
     """
 
     def __init__(self, body: Body, scenario: Scenario, lifted: float = 0.0) -> None:
@@ -62,8 +62,8 @@ class World:
 
         Args:
             body: the true robot.
-            scenario: what happens.
-            lifted: the hoist holds it this much higher, m; 0: the soles rest on the floor.
+            scenario: course of the run.
+            lifted: height by which the hoist lifts the soles off the floor, m.
         """
         self.scenario = scenario
         self.model = model = body.model
@@ -88,10 +88,10 @@ class World:
         self._fallen = False
         self._truths = 0
         self._level = _turn_between(-model.opt.gravity, np.array((0.0, 0.0, 1.0)))
-        """Quaternion: turns the floor's axes into axes whose z is up."""
+        """Quaternion that turns floor axes into axes whose z is up."""
         x, y, z = model.opt.gravity.tolist()
         self._lean = (x / z, y / z)
-        # the hoist hangs from above: on a slope it holds the torso aside of the floor's normal
+        # the hoist hangs vertically: on a slope it holds the torso off the floor's normal
         placement.stand_up(body.stand_q, self._lean)
         self.actuation.settle(data.qpos[placement.q_index])
         data.qpos[2] += lifted
@@ -104,7 +104,7 @@ class World:
         )
         self.outside = OutsideForces(body, scenario, self._torso)
 
-    # ---- its start, and how it goes on
+    # ---- start and resume
 
     def stand_at(self, q: Array) -> None:
         """Stand the robot still, soles flat, at joint angles q (12,), rad; no hoist.
@@ -116,7 +116,7 @@ class World:
         self.remove_hoist()
 
     def hidden(self) -> tuple[float, ...]:
-        """Return what MuJoCo does not hold: the person, the drivetrain, torques on their way."""
+        """Return the state outside MuJoCo: the person, the drivetrain, delayed torques."""
         wearer = self.outside.wearer
         person = wearer.above, wearer.rate, wearer.asked_n, wearer.reach
         return (*person, *self.actuation.numbers())
@@ -145,7 +145,7 @@ class World:
         return self.time - self._start_time if math.isfinite(self._start_time) else -1.0
 
     def start(self) -> None:
-        """Let the scenario begin now."""
+        """Start the scenario now."""
         self._start_time = self.time
 
     def lead(self) -> Lead:
@@ -153,13 +153,13 @@ class World:
         return self.outside.lead(self.scenario_s)
 
     def take_hand(self, asked: HandLead) -> None:
-        """Let somebody lead the hand from where it is, or push."""
+        """Accept a request to lead the hand from its present position, or to push."""
         if self.outside.led_hand is None:
             self.outside.led_hand = LedHand()
-        self.outside.led_hand.ask(asked, self.lead())
+        self.outside.led_hand.request(asked, self.lead())
 
     def let_go(self) -> None:
-        """Let the operator take the hand off."""
+        """Take the operator's hand off the harness."""
         self.outside.holds = False
 
     @property
@@ -168,21 +168,21 @@ class World:
         return self.outside.hoist.share
 
     def release_hoist(self) -> None:
-        """Let the hoist down."""
+        """Start to release the hoist."""
         self.outside.hoist.releasing = True
 
     def remove_hoist(self) -> None:
-        """Take the hoist away at once."""
+        """Remove the hoist at once."""
         self.outside.hoist.share = 0.0
 
-    # ---- a step, and what can be seen between two
+    # ---- a step, and measurements between steps
 
     def step(self, motor_torque: Array) -> None:
-        """Move on by one time step under motor torques (12,) in N m.
+        """Advance by one time step under motor torques (12,), N m.
 
-        MuJoCo puts the robot back to its start, without an error, when a force is no number or the
-        motion diverges: such a robot counts as fallen. A torque that is no number acts as zero, and
-        never reaches the drivetrains, which would keep it.
+        MuJoCo resets the robot to its start, without an error, when a force is not finite or the
+        motion diverges; the robot then counts as fallen. A torque that is not finite acts as zero,
+        because it would stay in the drivetrains' state.
         """
         actuation, joints = self.actuation, self.joints
         if not math.isfinite(motor_torque @ motor_torque):
@@ -224,7 +224,7 @@ class World:
         return rates
 
     def truth(self, t_ns: int, real_time_factor: float, late_s: float) -> SimTruth:
-        """Return the world as it is, for the log and the verdict."""
+        """Return the true state of the world, for the log and the verdict."""
         placement, outside = self.placement, self.outside
         posture = measure_posture(self.data, self._torso_id, placement.feet, placement.ankles)
         self._fallen |= posture.fallen

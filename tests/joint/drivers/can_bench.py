@@ -105,7 +105,7 @@ class Bench:
     def wait(self, seconds: float) -> None:
         self.now_ns += round(seconds * 1e9)
         if self.talks and self.buses:
-            self.driver._link.watch.heard(self.now_ns)
+            self.driver._link.watch.received(self.now_ns)
 
     def after(self, ms: float) -> DriveReading | None:
         """Read so much later what there is."""

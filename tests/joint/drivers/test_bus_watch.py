@@ -36,7 +36,7 @@ CYCLE_MS = 5
 def live_watch(*, echoes: bool = True) -> BusWatch:
     """Return a watch of a bus that carries, whose drive was heard at time 0."""
     watch = BusWatch(echoes=echoes)
-    for happens in (watch.heard, watch.sent, watch.carried):
+    for happens in (watch.received, watch.sent, watch.carried):
         happens(0)
     return watch
 
@@ -61,7 +61,7 @@ def test_nothing_is_sent_behind_a_frame_that_is_not_carried_or_armed_on_an_old_o
         watch = live_watch()
         if waits:
             watch.sent(0)
-        watch.heard(now)
+        watch.received(now)
         assert not waits or watch.may_send(now) == (now <= STUCK_MS * NS_PER_MS)
         assert not waits or watch.restart_due(now) == (now > RESTART_MS * NS_PER_MS)
         assert waits or watch.may_arm(now) == (now <= PROOF_MS * NS_PER_MS)
@@ -73,7 +73,7 @@ def test_after_an_outage_a_probe_is_carried_before_anything_is_sent() -> None:
     watch.restarted(40 * NS_PER_MS, done=True)
     back = 3000 * NS_PER_MS
     assert not watch.probe_due(back), "not before the drive is heard"
-    watch.heard(back)
+    watch.received(back)
     assert not watch.may_send(back)
     assert watch.probe_due(back)
     watch.sent(back)
@@ -87,7 +87,7 @@ def test_a_bus_that_carries_nothing_though_the_drive_is_heard_counts_as_lost() -
     watch, told_ms, probes = live_watch(), 0, 0
     for ms in range(1, 1000, 2):
         now = ms * NS_PER_MS
-        watch.heard(now)
+        watch.received(now)
         if watch.restart_due(now):
             watch.restarted(now, done=True)
         if watch.may_send(now):
@@ -104,7 +104,7 @@ def test_a_silent_bus_is_probed_once_unless_the_interface_cannot_be_restarted() 
     for done, probes in ((True, 1), (False, 0)):
         watch = BusWatch(echoes=True)
         watch.restarted(0, done=done)
-        watch.heard(0)
+        watch.received(0)
         watch.carried(0)
         due = [watch.probe_due(ms * NS_PER_MS) for ms in range(QUIET_MS + 1, 500)]
         assert sum(due) == probes
@@ -114,7 +114,7 @@ def test_lost_echoes_do_not_make_a_live_bus_a_dead_one() -> None:
     watch, dice = live_watch(), random.Random(0)
     for ms in range(0, 20_000, 2):
         now = ms * NS_PER_MS
-        watch.heard(now)
+        watch.received(now)
         if dice.random() > 0.3:
             watch.carried(now)
         watch.sent(now)

@@ -99,7 +99,7 @@ def test_a_position_needs_a_known_firmware_and_counts_for_0_5(
     rig: Rig, shed: Shed, dialect: DialectName
 ) -> None:
     driver = shed.driver(counts_per_turn=None)
-    with pytest.raises(DriveError, match="which firmware"):
+    with pytest.raises(DriveError, match="shown the firmware yet"):
         driver.set_position((0.0, 0.0))
     rig.cycle(driver)
     with pytest.raises(DriveError, match="counts") if dialect == "0.5" else nullcontext():

@@ -146,7 +146,7 @@ def test_a_torque_has_its_sign_whichever_way_the_phases_are_wired(signs: tuple[i
     name = "encoder__config__direction"
     wired = {f"axis{axis}__{name}": value for axis, value in enumerate(signs)}
     found = board(**currents(10.0, -20.0), **wired)
-    asyncio.run(found.look())
+    asyncio.run(found.read_settings())
     assert asyncio.run(found.torques(0.5)) == (signs[0] * 5.0, signs[1] * -10.0)
     none = board(**currents(float("nan"), 1.0))
     assert asyncio.run(none.torques(0.5)) is None, "a current that is no number"

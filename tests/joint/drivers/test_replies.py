@@ -113,7 +113,7 @@ def run(
     pair = EncoderPair()
     samples = []
     for now_ns, k, axis in sorted(frames):
-        pair.take(axis, (float(k), 0.0), now_ns)
+        pair.store(axis, (float(k), 0.0), now_ns)
         if pair.complete():
             (a, _), (b, _) = pair.estimates
             samples.append((a, b))
@@ -153,13 +153,13 @@ def test_frames_that_waited_together_make_a_sample_of_the_newest_number() -> Non
     pair = EncoderPair()
     for k in range(5):
         for axis in (0, 1):
-            pair.take(axis, (float(k), 0.0), 10**9)
+            pair.store(axis, (float(k), 0.0), 10**9)
     assert pair.complete()
     for bad in ((math.nan, 0.0), (0.0, math.inf)):
         assert not pair.complete()
         assert pair.estimates == [(4.0, 0.0), (4.0, 0.0)]
         for axis in (0, 1):
-            pair.take(axis, bad, 10**9)
+            pair.store(axis, bad, 10**9)
 
 
 @pytest.mark.parametrize("dialect", ["0.5", "0.6"])

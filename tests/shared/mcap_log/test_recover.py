@@ -116,7 +116,7 @@ def test_what_keeps_a_recovery_from_its_end_leaves_the_original_and_nothing_else
     tried(path, monkeypatch)
     assert path.read_bytes() == before
     assert sorted(tmp_path.iterdir()) == there
-    assert ("no space to recover it" in caplog.text) is (tried is without_space)
+    assert ("not enough space to recover it" in caplog.text) is (tried is without_space)
 
 
 def test_the_rescue_of_a_directory_takes_what_is_unfinished_and_survives_the_rest(

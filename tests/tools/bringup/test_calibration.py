@@ -75,11 +75,11 @@ def test_a_new_board_is_calibrated_marked_saved_and_ready_after_power_up() -> No
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"motor__config__calibration_current": 30.0}, r"PHASE_RESISTANCE_OUT_OF_RANGE; look at"),
-        ({"motor__config__pole_pairs": 14}, r"0\.2.. turns where 0\.143.* with 7 pole pairs: is"),
-        ({"encoder__config__cpr": 8192}, r"0\.5.. turns where 0\.286 .*: is .* or encoder"),
+        ({"motor__config__calibration_current": 30.0}, r"PHASE_RESISTANCE_OUT_OF_RANGE; check"),
+        ({"motor__config__pole_pairs": 14}, r"0\.2.. turns instead.* 7 pole pairs: check"),
+        ({"encoder__config__cpr": 8192}, r"0\.5.. turns instead of 0\.286.*: check .* and encoder"),
         ({"load": 2.0}, r"CPR_POLEPAIRS_MISMATCH; its encoder counted .*hang the leg"),
-        ({"blocked": 1.0}, r"NO_RESPONSE; the encoder counts nothing.*blocked"),
+        ({"blocked": 1.0}, r"NO_RESPONSE; the encoder does not count.*blocked"),
         ({"broken": 1e6}, r"motor: error MOTOR_FAILED, .*three phase wires"),
     ],
 )  # fmt: skip
@@ -141,19 +141,19 @@ def test_a_calibration_that_somebody_else_breaks_off_is_not_taken_for_one() -> N
     begun_s = board.clock()
     nothing: Any = lambda *_: None  # noqa: E731
     result = calibration.calibrate_board(board, AXES, Interrupts(), nothing, board.clock, pause)
-    assert "without an error: something else gives it orders" in result.why
+    assert "without an error: another program commands it" in result.why
     assert calibration.uncalibrated(board) == AXES
 
 
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"encoder__config__mode": 0}, r"encoder\.config\.mode is 0: no absolute encoder"),
+        ({"encoder__config__mode": 0}, r"encoder\.config\.mode is 0: not an absolute encoder"),
         ({"motor__config__current_lim": 6.0}, r"calibration_current is 15 A; .*at most 14 A"),
-        ({"motor__config__calibration_current": 0.0}, "more than 0"),
-        ({"motor__config__pole_pairs": 0}, r"would be turned by inf turns"),
-        ({"volts": 3.0}, r"its supply has 3\.0 V"),
-        ({"load": 3.0}, "its motors move by themselves"),
+        ({"motor__config__calibration_current": 0.0}, "above 0"),
+        ({"motor__config__pole_pairs": 0}, r"would turn by inf turns"),
+        ({"volts": 3.0}, r"its supply is at 3\.0 V"),
+        ({"load": 3.0}, "its motors move on their own"),
     ],
 )
 def test_a_board_that_is_not_set_up_or_does_not_stand_still_is_refused(
@@ -257,8 +257,8 @@ def test_a_board_that_is_unplugged_meanwhile_does_not_stop_the_others(
     said = " ".join(capsys.readouterr().out.split())
     assert code == FAULT_EXIT_CODE
     assert "knee_left: ODrive 3A: read: no answer" in said
-    assert "switch its supply off and on after that" in said
-    assert "without a zero: hip_left; next `xrl drive zero`" in said
+    assert "then switch its supply off and on" in said
+    assert "unzeroed: hip_left; next, run `xrl drive zero" in said
     assert "direction is -1: swap two of the motor's phases" in said
     assert said.endswith("not calibrated: knee_left")
 

@@ -170,7 +170,7 @@ def test_interfaces_are_there_and_up(real: RobotConfig, tmp_path: Path) -> None:
     write(tmp_path, "sys/class/net/can0/flags", "0x40081")
     write(tmp_path, "sys/class/net/can1/flags", "0x40080")
     rows = {row.subject: row for row in socketcan_rows(real, tmp_path, {})}
-    assert [rows[f"can{i}"].found for i in range(3)] == ["up", "down", "not there"]
+    assert [rows[f"can{i}"].found for i in range(3)] == ["up", "down", "missing"]
     assert "ip link set can1 up type can bitrate 1000000" in rows["can1"].fix
 
 

@@ -111,7 +111,7 @@ def test_a_joint_that_moves_too_little_did_not_follow(
     drive: BenchDrive, robot: RobotConfig
 ) -> None:
     drive.friction = 9.5  # below the limit, so nothing stops it, but hardly anything moves
-    assert not verdict(jogged(drive, robot, 0.01))["theta went"].good
+    assert not verdict(jogged(drive, robot, 0.01))["theta travel"].good
 
 
 def test_a_load_that_drags_the_sibling_along_is_seen(drive: BenchDrive, robot: RobotConfig) -> None:
@@ -120,8 +120,8 @@ def test_a_load_that_drags_the_sibling_along_is_seen(drive: BenchDrive, robot: R
         for s in jogged(drive, robot)
     ]
     rows = verdict(dragged)
-    assert not rows["phi strayed"].good
-    assert rows["theta went"].good
+    assert not rows["phi moved"].good
+    assert rows["theta travel"].good
 
 
 def turned(axis: int, angle: float) -> np.ndarray:

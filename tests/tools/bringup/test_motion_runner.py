@@ -69,9 +69,9 @@ FAULTS: dict[str, tuple[dict[str, object], JogPlan, str]] = {
     "motors that push the wrong way": ({"reversed": True}, PLAN, "apart|torque limit"),
     "a drive that disarms": ({"fails_at_s": 1.2}, PLAN, "the drive is ERROR"),
     "a drive that does not arm": ({"never_arms": True}, PLAN, "does not arm: IDLE"),
-    "a drive that falls silent": ({"silent_at_s": 1.2}, PLAN, "no sample of the drive"),
+    "a drive that falls silent": ({"silent_at_s": 1.2}, PLAN, "no sample from the drive"),
     "a drive that stays armed": ({"deaf": True}, PLAN, "^$"),
-    "samples that come too rarely": ({}, PLAN, "the drive's samples come too rarely"),
+    "samples that come too rarely": ({}, PLAN, "the drive's samples arrive too rarely"),
 }
 
 
@@ -97,7 +97,7 @@ def test_a_fault_stops_it_within_the_torque_limit_and_the_drive_is_idled(
 @pytest.mark.parametrize(
     ("status", "words"),
     [
-        (DriveStatus.UNZEROED, "does not know where the joint is; `xrl drive zero`"),
+        (DriveStatus.UNZEROED, "does not know where the joint is; run `xrl drive zero`"),
         (DriveStatus.ARMED, "armed .closed loop. by another program"),
         (DriveStatus.LOST, "does not answer"),
     ],
@@ -147,7 +147,7 @@ def test_an_error_of_our_own_idles_the_drive_or_says_that_it_did_not(
 @pytest.mark.parametrize(
     ("q_seen", "plan", "words"),
     [
-        ((START[0], START[1] + 0.06), PLAN, "has moved by 0.060 rad"),
+        ((START[0], START[1] + 0.06), PLAN, "moved by 0.060 rad"),
         (START, jog_by(2.0), "would go to 1.000"),
     ],
     ids=["moved after the question", "led out of its limits"],
@@ -288,7 +288,7 @@ def test_over_can_both_axes_get_the_robot_files_limits_more_than_once(
     wanted = (robot.drive.vel_limit, robot.drive.current_lim)
     assert all(limits == pytest.approx(wanted) for _, limits in sent)
     assert not link.open
-    with pytest.raises(DriveError, match="takes no frames"):
+    with pytest.raises(DriveError, match="accepts no frames"):
         motion_runner.give_back(robot, MODULE, NOWHERE)
 
 
@@ -306,5 +306,5 @@ def test_over_usb_they_are_written_and_read_back(
     with pytest.raises(DriveError, match="did not keep"):
         motion_runner.give_back(on_usb, MODULE, NOWHERE)
     found.boards.clear()
-    with pytest.raises(DriveError, match=f"{SERIAL}: not there"):
+    with pytest.raises(DriveError, match=f"{SERIAL}: not connected"):
         motion_runner.give_back(on_usb, MODULE, NOWHERE)

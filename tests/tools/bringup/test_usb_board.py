@@ -86,7 +86,7 @@ def test_a_name_that_the_board_does_not_have_is_refused_before_anything_is_writt
     usb: UsbRobot, board: UsbBoard
 ) -> None:
     before = usb.bank.settings.get(MODULE, VEL_LIMIT)
-    with pytest.raises(DriveError, match=r"firmware 0\.5\.6: it has no axis0\.nothing"):
+    with pytest.raises(DriveError, match=r"firmware 0\.5\.6: has no axis0\.nothing"):
         board.write({VEL_LIMIT: 1.0, "axis0.nothing": 1.0})
     assert usb.bank.settings.get(MODULE, VEL_LIMIT) == before
 

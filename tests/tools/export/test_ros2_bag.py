@@ -89,7 +89,7 @@ def test_when_the_planner_is_dead_the_diagnostics_say_so(bag: Path, run_file: Pa
             if dead:
                 said.append(rows["xrl: planner"].message)
     assert said
-    assert set(said) == {"silent: each module holds by itself"}
+    assert set(said) == {"silent: each module holds on its own"}
 
 
 def test_a_run_after_2038_is_refused_as_a_bag_and_has_its_other_exports(
@@ -102,7 +102,7 @@ def test_a_run_after_2038_is_refused_as_a_bag_and_has_its_other_exports(
     path = recorded_in_parts(log, tmp_path / "late")
     bag = tmp_path / "bag"
     assert cli.main(["log", "export", str(path), "--ros2bag", str(bag)]) == 2
-    assert "are beyond those of ROS 2, which end on 2038-01-19" in capsys.readouterr().err
+    assert "are outside the range of ROS 2, which ends on 2038-01-19" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [path]
     words = ["--csv", str(tmp_path / "tables")]
     assert cli.main(["log", "export", str(path), *words]) == 0

@@ -111,12 +111,12 @@ def test_a_module_without_states_is_not_guessed_at() -> None:
 @pytest.mark.parametrize(
     ("lead", "words"),
     [
-        (None, "planner silent: each module holds by itself"),
+        (None, "planner silent: each module holds on its own"),
         (LeadStatus("LEADING", 0.0, 1.2), "planner LEADING, margin 1.20, carries 0 N"),
         (LeadStatus("ALIGNING", 12.3, 1.2), "leads again in 12 s"),
         (
             LeadStatus("LEADING", 0.0, 1.2, carried_n=310.0, wearer=WEARING[Wearing.RESTS]),
-            "carries 310 N; parked: a tug up opens it",
+            "carries 310 N; parked: tug up to unpark it",
         ),
         (
             LeadStatus("MISPLACED", 0.0, 1.2, "a foot is ahead"),
@@ -176,7 +176,7 @@ def test_another_fleet_is_named_and_the_own_is_not(monkeypatch: pytest.MonkeyPat
 def test_modules_that_follow_another_planner_are_named() -> None:
     own, other = (module_status(tracking(session=session)) for session in (7, 99))
     words = _describe_sessions(fleet_with(7, own, other))
-    assert words == "knee_right: last followed session 99, and the planner heard is 7"
+    assert words == "knee_right: last followed session 99, but the planner's session is 7"
     assert _describe_sessions(fleet_with(7, own, module_status(None))) == ""
 
 

@@ -50,7 +50,7 @@ def test_a_fleet_without_a_pace_goes_by_the_machines_clock(tmp_path: Path) -> No
 @pytest.mark.parametrize("text", ["", "fast", "0", "-1", "1.5", "nan", "inf"])
 def test_a_file_without_a_pace_is_refused(tmp_path: Path, text: str) -> None:
     (make_live_dir(tmp_path) / clock.PACE_FILE).write_text(text)
-    with pytest.raises(FleetError, match="is no pace"):
+    with pytest.raises(FleetError, match="is not a valid pace"):
         clock.keep_pace(tmp_path)
 
 
@@ -58,7 +58,7 @@ def test_a_file_without_a_pace_is_refused(tmp_path: Path, text: str) -> None:
     ("value", "simulated", "words"),
     [
         (0.5, False, "only a simulated fleet"),
-        *((value, True, "to 1 is right") for value in (0.0, 0.05, 1.01, float("nan"))),
+        *((value, True, "must be between") for value in (0.0, 0.05, 1.01, float("nan"))),
     ],
 )
 def test_a_pace_that_cannot_be_kept_is_refused(value: float, simulated: bool, words: str) -> None:

@@ -100,7 +100,7 @@ def test_drives_on_usb_are_not_looked_for_without_their_package(
     on_usb = robot_file(tmp_path, ('driver = "odrive_can"', 'driver = "odrive_usb"'))
     real = {"simulation": False}
     assert list(plan(run_dir, on_usb, services=["planner"], **real).commands) == ["planner"]
-    with pytest.raises(MissingPackageError, match="the extra `usb` brings it"):
+    with pytest.raises(MissingPackageError, match="the extra `usb` includes it"):
         plan(run_dir, on_usb, **real)
 
 
@@ -110,8 +110,8 @@ def test_drives_on_usb_are_not_looked_for_without_their_package(
         ({"services": ["plannr"]}, r"'plannr'.*planner"),
         ({"overrides": {"plannr": []}}, r"'plannr'.*planner"),
         ({"not_started": ["plannr"]}, r"'plannr'.*planner"),
-        ({"services": ["imu"]}, "imu: this robot has none"),
-        ({"services": ["ros2_gateway"]}, "it is started with --ros2"),
+        ({"services": ["imu"]}, "imu: this robot has no IMU"),
+        ({"services": ["ros2_gateway"]}, "it starts only with --ros2"),
     ],
 )
 def test_a_service_that_this_fleet_does_not_have_is_refused(
@@ -132,7 +132,7 @@ def test_a_service_that_this_fleet_does_not_have_is_refused(
         ('"{run}"', '"{Run}"', "process[0].command", "{Run} is not a placeholder here; one of {py"),
         ('"{run}"', '"{module}"', "process[0].command", "{module} is not a placeholder here"),
         ('name = "simulator"', 'name = "{simulator}"', "process[0].name", "one of {module}"),
-        ('name = "harness"', 'name = "knee_left"', "process", "'knee_left' stands twice"),
+        ('name = "harness"', 'name = "knee_left"', "process", "'knee_left' is in it twice"),
     ],
 )
 def test_a_bad_row_is_refused_with_its_key(
@@ -146,7 +146,7 @@ def test_a_bad_row_is_refused_with_its_key(
 def test_a_run_directory_too_long_for_sockets_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     plan(Path("/tmp") / ("long" * 25))  # its sockets lie elsewhere, in memory
     monkeypatch.setattr(run_directory, "_MEMORY_FOLDERS", ())
-    with pytest.raises(FleetError, match=r"too long by \d+ bytes"):
+    with pytest.raises(FleetError, match=r"\d+ bytes too long"):
         plan(Path("/tmp") / ("long" * 25))
 
 
@@ -178,5 +178,5 @@ def test_an_argument_with_special_characters_is_quoted_for_its_program(run_dir: 
 
 @pytest.mark.parametrize("text", ["a\nb", "a\rb"])
 def test_a_line_break_that_would_begin_another_setting_is_refused(text: str) -> None:
-    with pytest.raises(FleetError, match="has no line break; rename it"):
+    with pytest.raises(FleetError, match="has a line break; rename it"):
         one_line(text)

@@ -16,8 +16,8 @@ from tools.fleet.run_dir import RunDir
     ("injected", "words"),
     [
         (None, r"no fleet is up in .*; `xrl up --injectable` starts one"),
-        (False, "without a network proxy; `xrl down`, then"),
-        (True, "every impairment is over; `xrl status`"),
+        (False, "has no network proxy; run `xrl down`, then"),
+        (True, "every impairment has ended; run `xrl status`"),
     ],
     ids=["no fleet", "a fleet without a proxy", "a proxy that is down"],
 )

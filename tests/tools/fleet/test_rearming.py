@@ -43,7 +43,7 @@ def test_a_stop_ends_where_all_six_bear_their_load(other: tuple[Mode, DriveStatu
 )  # fmt: skip
 def test_beside_a_module_without_torque_none_is_rearmed(mode: Mode, drive: DriveStatus) -> None:
     why = hindrance(states(knee_left=(mode, drive)), [], HERE, planner=True)
-    assert why.startswith(f"knee_left is in {mode.name}, its drive {drive.name}; hang the robot")
+    assert why.startswith(f"knee_left is in {mode.name}, its drive is {drive.name}; hang the robot")
 
 
 def test_none_is_rearmed_while_it_moves_or_is_pulled_or_one_is_missing() -> None:

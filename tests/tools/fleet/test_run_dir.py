@@ -83,7 +83,7 @@ def test_a_folder_of_a_persons_own_files_is_refused_and_stays_as_it_is(run_dir: 
     (run_dir / "logs").mkdir(parents=True)
     (run_dir / "logs/run.log").write_text("mine")
     (run_dir / "supervisord.conf").write_text("mine too")
-    with pytest.raises(FleetError, match="holds logs, which does not belong to a fleet"):
+    with pytest.raises(FleetError, match="contains logs, which does not belong to a fleet"):
         RunDir(run_dir).claim()
     RunDir(run_dir).clear(keep_logs=False)
     SupervisedFleet(run_dir).stop()
@@ -97,7 +97,7 @@ def test_a_folder_of_a_persons_own_files_is_refused_and_stays_as_it_is(run_dir: 
 def test_one_file_with_a_name_that_a_fleet_uses_too_is_a_persons(run_dir: Path, name: str) -> None:
     run_dir.mkdir()
     (run_dir / name).write_text("mine")
-    with pytest.raises(FleetError, match=f"holds {name}, which does not belong to a fleet"):
+    with pytest.raises(FleetError, match=f"contains {name}, which does not belong to a fleet"):
         RunDir(run_dir).claim()
     assert (run_dir / name).read_text() == "mine"
 
@@ -122,7 +122,7 @@ def test_what_services_started_by_hand_or_an_earlier_version_left_is_no_obstacle
 def test_a_directory_that_others_may_write_to_is_refused(run_dir: Path, mode: int) -> None:
     run_dir.mkdir()
     run_dir.chmod(mode)
-    with pytest.raises(FleetError, match="others may write to it"):
+    with pytest.raises(FleetError, match="other users can write to it"):
         RunDir(run_dir).claim()
 
 
@@ -130,7 +130,7 @@ def test_a_fleet_whose_directory_became_writable_for_others_can_be_stopped(
     claimed: RunDir, capsys: pytest.CaptureFixture[str]
 ) -> None:
     claimed.path.chmod(0o777)
-    with pytest.raises(FleetError, match="others may write to it"):
+    with pytest.raises(FleetError, match="other users can write to it"):
         SupervisedFleet.attach(claimed.path)
     RearmGuard(claimed.path, "knee_left")
     assert cli.main(["estop", "--local", "--run-dir", str(claimed.path)]) != 0

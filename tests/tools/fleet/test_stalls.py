@@ -102,7 +102,7 @@ def test_a_nearly_full_machine_says_that_the_kernel_stops_a_core_that_real_time_
     monkeypatch.setattr(scheduling, "real_time_pause_ms", lambda: 50.0)
     words = describe_machine(idle)
     assert f" cores, {100 * idle:.0f} % idle beside the fleet" in words
-    assert ("the kernel stops for 50 ms in each second: `sudo sysctl kernel." in words) == told
+    assert ("for 50 ms in each second; to prevent that, run `sudo sysctl kernel." in words) == told
 
 
 @given(st.integers(ms(1e5), ms(1e9)), st.integers(ms(20), ms(9e4)))
@@ -186,7 +186,7 @@ def test_figures_leave_out_what_a_stall_made_of_a_run_and_a_line_tells_it(log: R
     assert row.said.endswith(" s: the machine stalled for 80 ms: all six held")
     words = shown(apart)
     assert row.said in words
-    assert "leave out what a stall made of the run" in words
+    assert "exclude the consequences of stalls" in words
 
 
 def test_stalls_without_effect_share_a_line() -> None:

@@ -202,9 +202,9 @@ def test_a_person_who_pulls_harder_at_rest_than_they_lead_is_told_so() -> None:
     log = MadeLog(lambda t: 24.0 if t > 14.0 else 12.0, minute, span_s=MINUTE_S)
     found = thresholds_of(cast(RunLog, log), ROBOT)
     assert found.thresholds.open_n == pytest.approx(IDLE_MARGIN * 24.0, abs=0.5)
-    assert "open by itself" in found.doubts[0]
+    assert "open on its own" in found.doubts[0]
 
 
 def test_without_squats_and_a_rest_nothing_is_measured() -> None:
-    with pytest.raises(RunError, match=r"0 squats and 0 s still in a crouch.*three times"):
+    with pytest.raises(RunError, match=r"0 squats and 0 s at rest in a crouch.*three times"):
         thresholds_of(cast(RunLog, MadeLog(lambda _t: 0.0)), ROBOT)

@@ -140,11 +140,11 @@ def test_each_reason_to_give_up_says_what_helps(robot: RobotConfig) -> None:
     damped = stand(robot, mode=int(Mode.DAMP))
     for said, words in (
         (gives_up(law(), [None] * 6, None, HEARD_S + 0.5), "ankle_right, knee_right, hip_right, "),
-        (gives_up(law(), faulty, None, 3.0), "ankle_right FAULT: it may bear weight"),
+        (gives_up(law(), faulty, None, 3.0), "ankle_right FAULT: the others may carry weight"),
         (gives_up(law(), standing, tripped, PATIENCE_S + 3.0), "does not lead (OVERLOADED)"),
         (gives_up(law(), standing, planner_status(), STALLED_S + 3.0), "it is held up at a COM"),
         (gives_up(law(), standing, None, HEARD_S + 3.0), "not all modules go to DAMP"),
-        (gives_up(law(), damped, None, 60.0), "down, and it still holds"),
+        (gives_up(law(), damped, None, 60.0), "down, but the robot still bears weight"),
     ):
         assert words in said
         assert "--limp" in said or "take the hand off" in said
@@ -162,7 +162,7 @@ def test_down_refuses_where_nobody_knows_and_leaves_a_simulator_as_it_was(
     flags = DownFlags(run_dir=tmp_path / "run")
     assert down.run(flags) == 0
     running |= {"knee_left": 1}
-    with pytest.raises(FleetError, match=r"files are gone.*`xrl down --limp`"):
+    with pytest.raises(FleetError, match=r"files are missing.*`xrl down --limp`"):
         down.run(flags)
     assert down.run(DownFlags(run_dir=tmp_path / "run", limp=True)) == 0
     running |= {"simulator": 2}

@@ -80,5 +80,5 @@ def test_a_scenario_is_taken_by_name_from_beside_the_robot_file_first(tmp_path: 
     shutil.copy(SCENARIOS / "stand.toml", own / "mine.toml")
     assert experiment.scenario_file("squat", config) == own / "squat.toml"
     assert experiment.scenario_file("crawl", config) == SCENARIOS / "crawl.toml"
-    with pytest.raises(FleetError, match=r"no scenario 'nothing'; one of .*crawl, .*mine, .*squat"):
+    with pytest.raises(FleetError, match=r"'nothing'; must be one of .*crawl, .*mine, .*squat"):
         experiment.scenario_file("nothing", config)

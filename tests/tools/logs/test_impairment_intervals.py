@@ -109,7 +109,7 @@ def test_a_limit_passed_with_links_impaired_is_marked_and_otherwise_not() -> Non
 
 def test_beside_a_figure_over_its_limit_it_is_told_what_decides() -> None:
     (row,) = (row for row in LIMITS if row.key == "operator_peak_n")
-    words = "does not decide: standing to the end does"
+    words = "Only these decide the verdict: standing to the end"
     assert words in shown(judged(operator_peak_n=row.limit + 1.0))
     assert words not in shown(judged(operator_peak_n=row.limit))
     fell = {"stood": False, "sound": False, "began": True, "fallen_at_s": 3.0}

@@ -75,8 +75,8 @@ def test_the_summary_counts_what_nobody_received_and_what_was_not_sent() -> None
     words = played.summary(1, 0.4)
     assert "30 messages on 1 keys in 0.40 s" in words
     assert "10 not sent" in words
-    assert "nobody listened to the first 3" in words
-    assert "nobody listened" in World(heard_from=99).play(1.0).summary(1, 0.4)
+    assert "no subscriber for the first 3" in words
+    assert "there was no subscriber" in World(heard_from=99).play(1.0).summary(1, 0.4)
 
 
 def test_parts_that_follow_each_other_hold_every_message_once(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_a_module_is_asked_for_exactly_where_there_is_one(tmp_path: Path) -> Non
     log = read_run(runs.write(tmp_path, [item(0)]))
     with pytest.raises(RunError, match="name a module"):
         log.messages(topics.JOINT_STATE)
-    with pytest.raises(RunError, match="name none"):
+    with pytest.raises(RunError, match="remove the module"):
         log.messages(topics.WRENCH, "knee_right")
 
 

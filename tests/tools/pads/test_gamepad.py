@@ -191,5 +191,5 @@ def test_without_the_package_or_a_pad_it_says_what_to_do(monkeypatch: pytest.Mon
     with pytest.raises(FleetError, match="no gamepad: none that this user may read; join group"):
         find_pad(None)
     monkeypatch.setitem(sys.modules, "sdl2", None)
-    with pytest.raises(MissingPackageError, match=r"the extra `pad` .*; or lead by keys: --keys"):
+    with pytest.raises(MissingPackageError, match=r"`pad` .*; or lead with the keyboard: --keys"):
         start_sdl()

@@ -101,7 +101,7 @@ def test_settings_are_written_after_a_backup_of_all_and_kept(run_dir: Path, tmp_
     result = verb(run_dir, tmp_path / "b", "--restore", str(file), "--apply")
     assert result.returncode == 0, result.stdout + result.stderr
     assert "1 settings written" in result.stdout
-    assert f"unzeroed: {MODULE}; `xrl drive zero`" in result.stdout
+    assert f"unzeroed by the restart: {MODULE}; run `xrl drive zero`" in result.stdout
     (kept,) = (tmp_path / "b").glob("*.json")
     (before,) = read_backup(kept).boards
     assert (before.module, before.serial_number) == (MODULE, SERIAL)
@@ -117,7 +117,7 @@ def test_a_board_is_led_through_its_calibration_and_no_other(run_dir: Path, tmp_
     result = verb(run_dir, tmp_path, *asked)
     assert result.returncode == 0, result.stdout + result.stderr
     assert f"{MODULE}.axis1: 0.1 ohm, 50 uH, direction 1" in result.stdout
-    assert f"without a zero: {MODULE}; next `xrl drive zero`" in result.stdout
+    assert f"unzeroed: {MODULE}; next, run `xrl drive zero" in result.stdout
 
 
 @pytest.fixture
@@ -136,20 +136,20 @@ def test_a_backup_is_for_the_modules_that_it_has(
     assert configure.modules_of(flags, robot, saved_as(SERIAL.lower())) == (MODULE,)
     assert configure.modules_of(flags, robot, None) == MODULES
     other = dataclasses.replace(flags, module=("hip_left",))
-    with pytest.raises(DriveError, match="no hip_left; it has knee_left"):
+    with pytest.raises(DriveError, match="no hip_left, only knee_left"):
         configure.modules_of(other, robot, saved_as(SERIAL))
 
 
 def test_a_backup_of_another_board_is_refused(
     robot: RobotConfig, flags: configure.ConfigureFlags
 ) -> None:
-    with pytest.raises(DriveError, match=f"3A00000000FF there and {SERIAL}"):
+    with pytest.raises(DriveError, match=f"3A00000000FF, but {SERIAL}"):
         configure.modules_of(flags, robot, saved_as("3A00000000FF"))
 
 
 def test_a_backup_of_another_firmware_is_refused(robot: RobotConfig) -> None:
     boards = {MODULE: BoardInMemory(as_wanted())}
-    with pytest.raises(DriveError, match=r"firmware 0\.5\.1, the board has 0\.5\.6"):
+    with pytest.raises(DriveError, match=r"firmware 0\.5\.1, but the board has 0\.5\.6"):
         configure.differences(robot, boards, saved_as(SERIAL, "0.5.1"))
     difference = configure.differences(robot, boards, saved_as(SERIAL, **{VEL_LIMIT: 2.0}))
     assert [change.name for change in difference] == [VEL_LIMIT]

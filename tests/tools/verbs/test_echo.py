@@ -21,11 +21,11 @@ def test_keys_are_named_by_patterns_and_a_wrong_one_says_what_there_is() -> None
     ]  # fmt: skip
     assert keys_named(["joint/**ate"]) == keys_named(["joint/*/state"])
     for wrong in ("joint/foot/state", "joint/*", "*state"):
-        with pytest.raises(RunError, match="no topic is so named; there are joint") as caught:
+        with pytest.raises(RunError, match="no topic has this name; the topics are") as caught:
             keys_named([wrong])
         assert str(caught.value).startswith(f"{wrong}: ")
 
 
 def test_a_message_of_another_type_is_told_and_not_a_traceback() -> None:
     text = as_text(STATE, encode(Estop(t_ns=0, seq=1, source="x")), [], as_json=False)
-    assert text.endswith("bytes that are no Wrench")
+    assert text.endswith("bytes that are not a valid Wrench")

@@ -84,7 +84,7 @@ def test_a_viewers_key_stands_by_for_nothing(
     file = tmp_path / "robot.toml"
     file.write_text(config_file.to_toml(secured), encoding="utf-8")
     assert exit_code(["estop", "--wait", "--config", file, "--run-dir", run_dir]) == 2
-    assert "to act takes an operator's" in capsys.readouterr().err
+    assert "this command needs an operator's key" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("how", ["a dropped session", "a hang-up"])
@@ -99,7 +99,7 @@ def test_one_that_waits_stops_when_its_terminal_goes(
     ) as waiting:
         os.close(terminal)
         told = b""
-        while b"q and Enter leaves" not in told:
+        while b"q and Enter quits" not in told:
             told += os.read(person, 1000)
         if how == "a hang-up":
             waiting.send_signal(signal.SIGHUP)

@@ -59,7 +59,7 @@ def test_margins_above_what_the_planner_asks_for_are_printed(
     certificate = config_file.load(path).certificate
     spoken = " ".join(said.split())
     found = re.search(
-        r"smallest margin[^:]*: ([\d.]+) of what is required.*?, ([\d.]+) with", spoken
+        r"smallest margin[^:]*: ([\d.]+) of the required one.*?, ([\d.]+) with", spoken
     )
     assert found, said
     assert float(found[1]) > certificate.margin_min
@@ -80,7 +80,7 @@ def test_check_reports_a_fit_until_the_robot_changes(
     path, _ = unladen
     schedule = path.with_name("lab.gains.json")
     assert exit_code(["gains", "--check", "--config", robot_file(tmp_path)]) == 3
-    assert "there is no gain schedule" in capsys.readouterr().out
+    assert "the gain schedule is missing" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == [tmp_path / "lab.toml"], "and writes none"
     before = schedule.read_bytes()
     assert exit_code(["gains", "--check", "--config", path]) == 0

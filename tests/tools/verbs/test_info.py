@@ -156,7 +156,7 @@ def test_an_injection_is_reported_with_its_counts(
         items.append((topics.LINK_EVENT.key(ROBOT), codec.encode(event), t_ms * MS))
     output = " ".join(as_text(capsys, runs.write(tmp_path, items)).split())
     assert "injected planner->left delay=5ms: 0." in output
-    assert "20 messages passed, 7 lost (s since the log begins)" in output
+    assert "20 messages passed, 7 lost (s since the start of the log)" in output
 
 
 def test_a_file_without_a_message_is_shown(

@@ -55,7 +55,7 @@ def test_a_stick_that_is_held_at_the_start_leads_nothing_and_is_named(
     device.press(HOLD)
     device.set_button(HOLD, is_down=True)
     leader = Following(device, 1)
-    with pytest.raises(FleetError, match=r"not begun within 0.2 s: let go of: right stick \(100 %"):
+    with pytest.raises(FleetError, match=r"not ready within 0.2 s: let go of: right stick \(100 %"):
         by_pad(pad, leader)
     assert not leader.led
 

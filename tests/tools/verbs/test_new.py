@@ -40,7 +40,7 @@ def test_an_empty_directory_is_filled_and_a_name_with_a_space_is_quoted(
     assert exit_code(["new", "."]) == 0
     assert (tmp_path / "robot.toml").is_file()
     assert exit_code(["new", tmp_path / "my lab"]) == 0
-    assert f"what next:\n  cd '{tmp_path}/my lab'" in capsys.readouterr().out
+    assert f"next steps:\n  cd '{tmp_path}/my lab'" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def test_beside_it_a_second_is_refused_and_after_a_kill_it_sends_no_more(
     """Beside a second one the first would not be missed."""
     with held(tmp_path, files):
         assert cli.main(["pendant", "--run-dir", str(tmp_path)]) == 2
-    assert "another pendant is held" in capsys.readouterr().err
+    assert "another pendant is active" in capsys.readouterr().err
     beats = [file.beats for file in files]
     assert min(beats) > 3
     time.sleep(0.1)

@@ -68,7 +68,7 @@ def test_a_harness_that_is_held_is_not_tared(up: float, refused: bool) -> None:
 
     service = Service(answer)
     if refused:
-        with pytest.raises(FleetError, match=r"30\.1 N.*release it.*--anyway"):
+        with pytest.raises(FleetError, match=r"30\.1 N.*unload it.*--anyway"):
             tare.tare(service, service, anyway=False)
         assert service.requests == []
     service = Service(answer)
@@ -79,9 +79,9 @@ def test_a_harness_that_is_held_is_not_tared(up: float, refused: bool) -> None:
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        (None, "silent"),
+        (None, "no wrench"),
         (wrench(), "did not begin"),
-        (wrench(0.0, Tare.UNSTEADY), "the forces move"),
+        (wrench(0.0, Tare.UNSTEADY), "the forces vary"),
         (wrench(0.0, Tare.RUNNING, saturated=True), "end of its range"),
         (wrench(0.0, Tare.RUNNING), "do not send steadily"),
     ],

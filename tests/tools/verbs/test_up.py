@@ -51,12 +51,12 @@ def test_where_nobody_looks_on_the_services_start_without_keys_and_without_a_rec
     not_valid_yet: RobotConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     up._check_keys(not_valid_yet, must=False)
-    assert "no link over TLS: " in capsys.readouterr().err
+    assert "links over TLS will fail: " in capsys.readouterr().err
     taken = tmp_path / "out"
     taken.write_text("a file", encoding="utf-8")
     up._make_record_folder(taken / "now", must=False)
     assert "not recorded: " in capsys.readouterr().err
-    with pytest.raises(RunError, match="cannot be made"):
+    with pytest.raises(RunError, match="cannot create it"):
         up._make_record_folder(taken / "now", must=True)
 
 

@@ -159,8 +159,8 @@ def test_a_drive_that_lost_its_power_is_known_armed_or_not(
     [
         ({}, "^$"),
         ({"speed": 0.049, "moved": 0.0049}, "^$"),
-        ({"speed": 0.051}, "it moves: 0.05 rad/s"),
-        ({"moved": 0.0051}, "it moves.*hold it still"),
+        ({"speed": 0.051}, "the joint moves: 0.05 rad/s"),
+        ({"moved": 0.0051}, "the joint moves.*hold it still"),
         ({"status": DriveStatus.LOST}, "does not answer"),
         ({"status": DriveStatus.ARMED}, "armed"),
         ({"status": DriveStatus.ERROR, "error": int(AxisError.WATCHDOG_TIMER_EXPIRED)}, "^$"),
@@ -224,7 +224,7 @@ def test_a_stand_is_at_its_height_level_and_inside_the_limits(
 
 def test_over_usb_the_services_must_be_down(robot: RobotConfig, tmp_path: Path) -> None:
     usb = with_driver(robot, "odrive_usb")
-    with pytest.raises(FleetError, match=r"has the drive's USB.*xrl down"):
+    with pytest.raises(FleetError, match=r"holds the drive's USB.*xrl down"):
         verb.refuse_services(usb, {MODULE: SupervisedFleet(tmp_path)})
     verb.refuse_services(usb, {MODULE: None})
 

@@ -144,7 +144,7 @@ def test_a_night_without_power_is_resumed_to_a_milliradian(
     said = capsys.readouterr().out
     assert said.count("unmoved") == 6
     assert bench.run(resume=True) == 0
-    assert "zeroed already; left as they are" in capsys.readouterr().out
+    assert "already zeroed; left unchanged" in capsys.readouterr().out
 
 
 def test_legs_that_were_cut_off_at_work_are_resumed_once_they_have_swung(
@@ -158,7 +158,7 @@ def test_legs_that_were_cut_off_at_work_are_resumed_once_they_have_swung(
     assert bench.run(resume=True, untouched=True, level=True) == FAULT_EXIT_CODE
     assert max(bench.errors()[1:3]) == 9.0
     said = capsys.readouterr().out
-    assert re.search(r"hip_left: refused: no rest of it is stored.*--swing", said, re.DOTALL)
+    assert re.search(r"hip_left: refused: no rest is stored for it.*--swing", said, re.DOTALL)
     watch = zeroing.watch
 
     def pushed(*args: object) -> object:
@@ -230,7 +230,7 @@ def test_down_stores_where_real_drives_rest(
     for module, zero in before.modules.items():
         assert after.modules[module].rest == pytest.approx(zero.rest, abs=1e-3)
     kept.write_text("{")
-    assert "is not kept: " in zero_record.rests_after_down(lab, tmp_path, services)
+    assert "are not stored: " in zero_record.rests_after_down(lab, tmp_path, services)
 
 
 # ---- whose zero it is
@@ -244,10 +244,10 @@ KEPT: dict[str, Value] = {"axis0.encoder.config.phase_offset": 4021}
     [
         (None, "^$"),
         (Identity("3A0000000005", KEPT), "^$"),
-        (Identity("3A0000000009", KEPT), "board 3A0000000009 is not 3A0000000005"),
+        (Identity("3A0000000009", KEPT), "board 3A0000000009, not 3A0000000005"),
         (
             Identity("3A0000000005", {"axis0.encoder.config.phase_offset": 3977}),
-            "calibrated since.*phase_offset is 3977, and was 4021",
+            "calibrated since.*phase_offset is 3977, but was 4021",
         ),
     ],
 )
@@ -270,8 +270,8 @@ def test_the_robot_file_s_own_changes_are_named(robot: RobotConfig) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "no zeros of `xrl drive zero`"),
-        ('{"gear_ratio": 17.5, "encoder_counts_per_turn": 8192}', "encoder_counts_per_turn 8192"),
+        ("{", "not a file of `xrl drive zero`"),
+        ('{"gear_ratio": 17.5, "encoder_counts_per_turn": 8192}', "counts_per_turn is 8192"),
         ('{"gear_ratio": 17.5, "encoder_counts_per_turn": 16384, "x": 1}', "unknown field"),
     ],
 )

@@ -57,7 +57,7 @@ def test_hand_and_push_are_for_a_simulator_and_cuts_for_a_network_proxy(robot: R
     simulated = orders_of(robot, Fleet((*SIMULATED, "network_proxy")))
     assert {"hand", "push", "cut"} <= set(simulated.orders)
     said = orders_of(robot, Fleet(REAL)).carry_out(Order(order="hand", height=1.0))
-    assert "'hand' is no order here; one of estop" in said
+    assert "'hand' is not an order here; must be one of estop" in said
 
 
 def test_a_joint_service_is_killed_so_that_its_next_process_may_arm(robot: RobotConfig) -> None:
@@ -75,8 +75,8 @@ def test_what_cannot_be_done_is_said_in_words(robot: RobotConfig) -> None:
     orders = orders_of(robot, Fleet(SIMULATED))
     assert "no service 'cook'" in orders.carry_out(Order(order="kill", service="cook"))
     assert "No such process" in orders.carry_out(Order(order="kill", service="recorder"))
-    assert "not linked" in orders.carry_out(Order(order="hand", height=1.0))
-    assert "by shared memory only" in orders.carry_out(Order(order="estop"))
+    assert "no link" in orders.carry_out(Order(order="hand", height=1.0))
+    assert "through shared memory only" in orders.carry_out(Order(order="estop"))
     cutter = orders_of(robot, Fleet((*SIMULATED, "network_proxy")))
     assert "one of left leg" in cutter.carry_out(Order(order="cut", service="cable"))
 
@@ -87,7 +87,7 @@ def test_without_leave_a_page_only_looks(robot: RobotConfig) -> None:
     assert source.orders == ()
     for order in ("estop", "kill", "hand"):
         said = source.carry_out(Order(order=order, service="planner", height=1.0))
-        assert "this page only looks" in said
+        assert "this page cannot act" in said
     assert fleet.asked == []
 
 
@@ -103,9 +103,9 @@ def test_a_viewers_key_may_not_act(robot: RobotConfig, tmp_path: Path) -> None:
     ("terminal", "typed", "refusal"),
     [
         (True, "{name}", ""),
-        (True, "yes", "another name"),
-        (True, "", "another name"),
-        (False, "{name}", "only if somebody types"),
+        (True, "yes", "not the name of this robot"),
+        (True, "", "not the name of this robot"),
+        (False, "{name}", "only after a person types"),
     ],
 )
 def test_a_real_robots_name_has_to_be_typed_in_a_terminal(

@@ -73,7 +73,7 @@ def test_a_leg_that_is_cut_off_makes_all_hold_and_comes_back(source: LockstepSou
 @pytest.mark.parametrize(
     ("order", "words"),
     [
-        (Order(order="dance"), "'dance' is no order; one of hand, push"),
+        (Order(order="dance"), "'dance' is not an order; must be one of hand, push"),
         (Order(order="kill", service="simulator"), "'simulator' has no process here"),
         (Order(order="start"), "'' has no process here"),
     ],

@@ -223,7 +223,7 @@ async def test_what_is_not_understood_is_told_and_the_page_stays_open(
 ) -> None:
     page = await bench.page()
     await page.send_str(text)
-    assert "not understood" in await message_with(page, "error")
+    assert "not a valid order" in await message_with(page, "error")
     assert bench.source.orders_taken == []
     await page.send_json({"order": "push"})
     await until(lambda: len(bench.source.orders_taken) == 1)
@@ -293,7 +293,7 @@ def test_a_port_in_use_is_told(robot: RobotConfig) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
-        with pytest.raises(FleetError, match="give another --port"):
+        with pytest.raises(FleetError, match="choose another --port"):
             asyncio.run(main(other.getsockname()[1]))
 
 

@@ -103,7 +103,9 @@ def _verbs_page() -> Iterator[str]:
         own = [row for row in found.items() if row not in shared]
         also = [f"{flag.split()[0].rstrip('`')}`" for flag, _ in found.items() & shared.keys()]
         yield f"\n## xrl {name}\n"
-        yield " ".join((parsers[name].description or "").split()) + "\n"
+        about = " ".join((parsers[name].description or "").splitlines()[1:])
+        if about:
+            yield about + "\n"
         if own:
             yield from table("flag | meaning", own)
             yield ""

@@ -135,14 +135,16 @@ def _table(section: type[msgspec.Struct], prefix: str, shipped: _Shipped) -> Ite
         if name == _NOT_IN_THE_FILE:
             continue
         if _section(hint) is not None:
-            rows.append((f"`{name}`", "table", "", "", "", "", doc or f"see `[{key}]`"))
+            if doc:
+                rows.append((f"`{name}`", "table", "", "", "", "", doc))
             continue
         value = shipped.values.get(key, "")
         value = f"`{value}`" if value and len(value) <= _LONGEST else ""
         meaning = doc or shipped.comments.get(key, "")
         rows.append((f"`{name}`", *_described(hint), _default(fields[name]), value, meaning))
-    yield from table("key | type | unit | range | default | shipped | meaning", rows)
-    yield ""
+    if rows:
+        yield from table("key | type | unit | range | default | shipped | meaning", rows)
+        yield ""
 
 
 def _default(field: msgspec.structs.FieldInfo) -> str:

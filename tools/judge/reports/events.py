@@ -1,4 +1,4 @@
-"""Events of a run in order: what was done to it, changes of state, silences, exceeded limits."""
+"""Events of a run in order: kills, faults, pushes, state changes, silences, exceeded limits."""
 
 from __future__ import annotations
 
@@ -50,16 +50,16 @@ class TimelineEvent(NamedTuple):
     plots; `limit`, `bad`, `note`: only in the list."""
     text: str
     mark: str = ""
-    """Label of the mark in the plots; empty: no mark."""
+    """Label of the mark in the plots, or an empty string for no mark."""
 
 
 class Events:
-    """The events of a run, whose parts are taken one after the other."""
+    """The events of a run, which is added in parts, in order."""
 
     def __init__(self) -> None:
         self._found: list[TimelineEvent] = []
         self._last: dict[tuple[_Watched, str], tuple[Any, str]] = {}
-        """Newest message of each state and its words."""
+        """Newest message of each state, and its words."""
         self._last_heard: dict[str, float] = {}
         self._silences: list[tuple[float, str, float]] = []
         self._violations: dict[tuple[str, str, Beyond], tuple[float, float]] = {}
@@ -79,7 +79,7 @@ class Events:
             self._add_violations(run, panel)
 
     def all(self, span: Span) -> list[TimelineEvent]:
-        """Return all events in the order of time."""
+        """Return all events in order of time."""
         found = [*self._found, *self._told_silences(), *self._told_violations()]
         found.sort(key=lambda row: row.t)
         left = len(found) - ROWS_MAX
@@ -91,7 +91,7 @@ class Events:
         return found
 
     def _changes(self, run: RunData, watched: _Watched) -> Iterator[TimelineEvent]:
-        """Yield the changes of a state, also one across the edge of two parts."""
+        """Yield the changes of a state, including changes between two parts."""
         changes: list[tuple[float, str, Any, Any]] = []
         for module in MODULES if watched.topic.per_module else ("",):
             before, known = self._last.get((watched, module), (None, ""))
@@ -111,7 +111,7 @@ class Events:
             yield TimelineEvent(t, "bad" if watched.is_bad(before, after) else "note", text)
 
     def _add_silences(self, run: RunData) -> None:
-        """Add the gaps in periodic topics, by the recorder's clock."""
+        """Add the gaps of periodic topics, by the recorder's clock."""
         for key, topic in topics.all_keys(run.log.robot).items():
             if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
                 continue
@@ -150,9 +150,9 @@ class Events:
                     self._violations[key] = first_s, before_s + duration_s
 
     def _told_violations(self) -> Iterator[TimelineEvent]:
-        """Yield the first violation of each limit; modules that pass it together in one row.
+        """Yield the first violation of each limit; modules that violate it together share a row.
 
-        The search for the cause of a fall begins at the earliest one.
+        The earliest one is the place to start the search for the cause of a fall.
         """
         found = sorted(
             (first_s, title, limit.words, label, duration_s)
@@ -168,7 +168,7 @@ class Events:
 
 
 def events_of(run: RunData) -> list[TimelineEvent]:
-    """Return all events of a whole run in the order of time."""
+    """Return all events of a whole run in order of time."""
     events = Events()
     events.add(run, panels_of(run))
     return events.all(run.span)
@@ -193,7 +193,7 @@ def _run_events(run: RunData) -> Iterator[TimelineEvent]:
 _RUN_EVENTS: Final[Mapping[int, tuple[str, str, str]]] = {
     RunEventKind.STARTED: ("note", "{0} starts", ""),
     RunEventKind.FINISHED: ("note", "{0} ends {1}", ""),
-    RunEventKind.KILLED: ("kill", "{0} gets SIG{1}", "{0} {1}"),
+    RunEventKind.KILLED: ("kill", "{0} receives SIG{1}", "{0} {1}"),
     RunEventKind.RESTARTED: ("restart", "{0} restarts", "{0} back"),
     RunEventKind.PUSHED: ("push", "push {1}", "push {2}"),
     RunEventKind.FAULTED: ("fault", "{0}: fault {1} begins", "{0} {1}"),
@@ -213,7 +213,7 @@ def _told(event: RunEvent) -> tuple[str, str, str]:
 
 
 def _network(run: RunData) -> Iterator[TimelineEvent]:
-    """Yield the begin and the end of each impairment, of all its directions together."""
+    """Yield the start and the end of each impairment, with all its directions together."""
     for row in impairments(run.log.messages(topics.LINK_EVENT)):
         begin_s, end_s = row.begin_s(run.zero_ns), row.end_s(run.zero_ns)
         yield TimelineEvent(begin_s, "network", f"network, {row.title}", row.title)
@@ -266,11 +266,11 @@ class _Watched(NamedTuple):
 
     topic: Topic
     who: str
-    """With {} for the modules."""
+    """Subject of the sentence, with {} for the modules."""
     words: Callable[[Any], str]
     """The state of a message in words."""
     is_bad: Callable[[Any, Any], bool]
-    """Whether a change is an alarm, from the messages before and after it."""
+    """True if a change is an alarm, from the messages before and after it."""
 
 
 def _drive(row: JointState) -> str:
@@ -285,7 +285,7 @@ def _drive_is_worse(before: JointState, after: JointState) -> bool:
 
 def _planner(row: PlannerStatus) -> str:
     trip = f", {name_of(Trip, row.trip)}" if row.mode == PlannerMode.TRIPPED else ""
-    waits = " (waits after drop-outs or trips)" if row.wait_s > 0.0 else ""
+    waits = " (waits after dropouts or trips)" if row.wait_s > 0.0 else ""
     return name_of(PlannerMode, row.mode) + trip + waits
 
 
@@ -305,7 +305,7 @@ _WATCHED: Final = (
 
 
 def _merged(names: Sequence[str]) -> list[str]:
-    """Return names of topics; the six of one topic as one name."""
+    """Merge the six names of one topic into one name."""
     left = list(dict.fromkeys(names))
     for topic in topics.TOPICS:
         six = [topic.name.replace("*", module) for module in MODULES]
@@ -318,7 +318,7 @@ Row = TypeVar("Row", bound=tuple[Any, ...])
 
 
 def _together(rows: Iterable[Row], key: Callable[[Row], Any]) -> list[list[Row]]:
-    """Group rows with equal keys at about the same time, which is the first field of a row."""
+    """Group rows that have equal keys and nearly the same time, which is a row's first field."""
     groups: list[list[Row]] = []
     open_: dict[Any, list[Row]] = {}
     for row in rows:

@@ -1,4 +1,4 @@
-"""The moving picture of a run: the robot from the side and from the front, as an animated GIF."""
+"""Animated GIF of a run: the robot from the side and from the front."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Point = tuple[float, float]
 FRAMES_S: Final = 12.5
 """Frames per second; a GIF counts in hundredths of a second."""
 SCALE: Final = 2
-"""Drawn larger and reduced, so that lines are smooth."""
+"""Frames are drawn larger by this factor and then reduced, for smooth lines."""
 SIZE: Final = (640, 400)
 COLOURS_MAX: Final = 64
 MIXTURES: Final = 4
@@ -35,7 +35,7 @@ PX_PER_M: Final = 200.0 * SCALE
 GROUND_Y: Final = 365.0 * SCALE
 PX_PER_N: Final = 0.9 * SCALE
 VIEWS: Final = ((170.0 * SCALE, 0, 1.0), (465.0 * SCALE, 1, -1.0))
-"""Centre, px; which horizontal axis (0: x, from the side; 1: y, from the front); its sign."""
+"""Centre, px; horizontal axis (0: x, seen from the side; 1: y, seen from the front); its sign."""
 BACKGROUND, INK, LINK, TORSO, COM_INK = "#ffffff", "#30363d", "#7b858f", "#c9d1d9", "#0d5ea6"
 HAND_INK, PUSH_INK = "#c44f1c", "#8c3399"
 MODE_INK: Final[dict[int, str]] = {
@@ -50,15 +50,15 @@ MODE_INK: Final[dict[int, str]] = {
 def write_gif(
     log: RunLog, robot: RobotConfig, path: Path, progress: Callable[[float], None]
 ) -> int:
-    """Draw a run, from its scenario's begin, and return the number of frames.
+    """Draw a run from the start of its scenario, and return the number of frames.
 
-    The pose is the simulated world's, or as the legs know the torso. `progress` takes 0 .. 1.
+    The pose comes from the simulated world, else from the legs. `progress` receives 0 .. 1.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     began = next((event.t_ns for event in events if event.kind == RunEventKind.STARTED), 0)
     chosen = [pose for pose in poses(log, robot, FRAMES_S) if pose.t_ns >= began]
     if not chosen:
-        raise RunError(f"{log.path}: the scenario never began; there is nothing to draw")
+        raise RunError(f"{log.path}: the scenario never started; there is nothing to draw")
     images = []
     for number, pose in enumerate(chosen):
         image = Image.new("RGB", (SIZE[0] * SCALE, SIZE[1] * SCALE), BACKGROUND)
@@ -80,7 +80,7 @@ def write_gif(
                 optimize=True,
             )
     except OSError as error:
-        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise RunError(f"{path}: cannot write it: {error.strerror or error}") from None
     return len(flat)
 
 
@@ -97,7 +97,7 @@ def world_frames(robot: RobotConfig, pose: RobotPose) -> dict[str, tuple[Array, 
 
 
 def _palette() -> Image.Image:
-    """Return an image whose palette has every ink, and each mixed with the background."""
+    """Return an image whose palette contains every ink, also mixed with the background."""
     inks = (BACKGROUND, INK, LINK, TORSO, COM_INK, HAND_INK, PUSH_INK, *MODE_INK.values())
     swatches = Image.new("RGB", (len(inks), MIXTURES), BACKGROUND)
     for column, ink in enumerate(inks):
@@ -114,9 +114,9 @@ def _caption(events: Sequence[RunEvent], pose: RobotPose) -> str:
     words = "led by the hand"
     for event in events:
         if event.t_ns <= pose.t_ns and event.kind == RunEventKind.KILLED:
-            words = f"{event.subject} killed: it holds"
+            words = f"{event.subject} killed: the robot holds"
         elif event.t_ns <= pose.t_ns and event.kind == RunEventKind.RESTARTED:
-            words = f"{event.subject} started again"
+            words = f"{event.subject} restarted"
     return words + ("   push" if any(pose.push) else "")
 
 
@@ -136,13 +136,13 @@ def _draw_frame(
 
 
 def _text(canvas: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int) -> None:
-    """Write a text whose upper left corner is at a pixel of the picture."""
+    """Write a text with its upper left corner at a pixel of the picture."""
     font = ImageFont.load_default(size * SCALE)
     canvas.text((at[0] * SCALE, at[1] * SCALE), text, fill=INK, font=font)
 
 
 def _arrow(canvas: ImageDraw.ImageDraw, at: Point, by: Point, ink: str) -> None:
-    """Draw an arrow from a point by a vector; none that is shorter than a pixel."""
+    """Draw an arrow from a point along a vector, unless it is shorter than a pixel."""
     length = float(np.hypot(*by))
     if length < SCALE:
         return

@@ -1,4 +1,4 @@
-"""Report page: one HTML file that contains all it needs and makes no network request."""
+"""Report page: one self-contained HTML file, which makes no network request."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ STYLES: Final = (VENDOR / "uPlot.min.css", HERE / "page.css")
 LIBRARY: Final = VENDOR / "uPlot.iife.min.js"
 SCRIPT: Final = HERE / "page.js"
 POINTS: Final = 4000
-"""Maximum number of points of a line: the least and the greatest value of each interval, so that
-a plot shows every extreme, and a page of an hour has 2 MB."""
+"""Maximum number of points of a line: the minimum and maximum of each interval, so that a plot
+shows every extreme and the page of an hour has 2 MB."""
 BEFORE_S: Final = {"fall": 3.0}
-"""A click on an event shows this time before it; else half a second."""
+"""Time before an event that a click on it shows, s; 0.5 for the other kinds."""
 HELP: Final = (
     "Drag in a plot to zoom all plots; double-click to show the whole run. The legends show the "
     "values at the cursor; click a name to hide or show its line. Dotted red lines are limits."
@@ -39,7 +39,7 @@ HELP: Final = (
 POLICY: Final = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 )
-"""Makes the browser refuse every request to another place."""
+"""Makes the browser refuse every request to another server."""
 
 
 class _PanelData:
@@ -51,7 +51,7 @@ class _PanelData:
         self._rows: dict[str, list[Bar]] = {}
 
     def add(self, panel: Panel, run: RunData) -> None:
-        """Add what a part of the run has of it."""
+        """Add this panel's data from a part of the run."""
         self._panel = panel
         for line in panel.lines:
             inside = run.inside(line.t) & (line.t >= run.span.begin) & (line.t <= run.span.end)
@@ -67,7 +67,7 @@ class _PanelData:
                     row.append((max(bar[0], run.span.begin), *bar[1:]))
 
     def as_data(self) -> dict[str, Any] | None:
-        """Return it as the page stores it; None if it has no data."""
+        """Return the panel as the page stores it, or None if it has no data."""
         panel, lines = self._panel, []
         for line, parts in self._lines.values():
             t, values = with_gaps(*map(np.concatenate, zip(*parts, strict=True)))
@@ -90,7 +90,7 @@ class _PanelData:
 
 
 def thinned(t: Array, values: Array, span: Span) -> tuple[Array, Array]:
-    """Return the finite samples of a line; of many only the extremes of each short interval."""
+    """Return the finite samples of a line; of many, only the extremes of each short interval."""
     finite = np.isfinite(values)
     t, values = t[finite], values[finite]
     width_s = 2.0 * (span.end - span.begin) / POINTS
@@ -104,7 +104,7 @@ def thinned(t: Array, values: Array, span: Span) -> tuple[Array, Array]:
 
 
 def with_gaps(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a line with NaN where it has no sample for too long."""
+    """Return a line with NaN in each gap between its samples."""
     steps = np.diff(t)
     usual = float(np.median(steps)) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > max(GAP_S, 5.0 * usual)) + 1
@@ -112,7 +112,7 @@ def with_gaps(t: Array, values: Array) -> tuple[Array, Array]:
 
 
 class Page:
-    """The page of a run, whose parts are taken one after the other."""
+    """The page of a run, which is added in parts, in order."""
 
     def __init__(self, zero_ns: int | None = None, span: Span | None = None) -> None:
         self._zero_ns, self._span = zero_ns, span
@@ -165,7 +165,7 @@ class Page:
 
 
 def render(log: RunLog) -> str:
-    """Return the page of a run that is in memory."""
+    """Return the page of a run that is loaded in memory."""
     page = Page()
     page.add(log)
     return page.html()
@@ -178,7 +178,7 @@ def render_parts(
     part_s: float = PART_S,
     done: Callable[[float], None] = lambda _: None,
 ) -> str:
-    """Return the page of a run, or of a part of it, with `part_s` of it in memory at a time."""
+    """Return the page of a run or of a part of it, loading only `part_s` at a time."""
     zero = zero_ns(index)
     offset_s = (index.span_ns[0] - zero) / NS_PER_S
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
@@ -188,13 +188,13 @@ def render_parts(
         heard = heard or bool(log.keys())
         page.add(log)
     if not heard:
-        raise RunError(f"{index.path}: has no message in this part; {SEE_INFO}")
+        raise RunError(f"{index.path}: no message in this part; {SEE_INFO}")
     return page.html()
 
 
 def _document(title: str, body: str, data: str) -> str:
     style = "\n".join(path.read_text(encoding="utf-8") for path in STYLES)
-    safe = data.replace("<", "\\u003c")  # so the data hold no end tag
+    safe = data.replace("<", "\\u003c")  # so that the data contain no end tag
     return f"""<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -240,6 +240,6 @@ def _listed(events: Sequence[TimelineEvent]) -> str:
         for row in events
     )
     return (
-        '<section id="timeline"><h2>Events</h2><p class="hint">Click one to show its time in the '
-        f'plots.</p><ol aria-label="events">{rows or "<li>no events</li>"}</ol></section>'
+        '<section id="timeline"><h2>Events</h2><p class="hint">Click an event to show its time in '
+        f'the plots.</p><ol aria-label="events">{rows or "<li>no events</li>"}</ol></section>'
     )

@@ -1,4 +1,4 @@
-"""The eight panels of a run: lines over one time axis, their limits, and bars of states. Pure.
+"""The eight panels of a run: lines over one time axis, limits, and bars of states. Pure functions.
 
 The report's page and `run.png` draw the same panels.
 """
@@ -26,13 +26,13 @@ from tools.judge.verdict import leading
 from tools.logs.impairment_intervals import impairments
 
 GAP_S: Final = 0.1
-"""A plot interrupts its line where a signal has no sample for longer than this."""
+"""A plot interrupts its line where a signal has no sample for longer than this, s."""
 AGE_REACH: Final = 1.2
-"""Top of the panel of ages, as a multiple of the oldest usable age: older commands are not used."""
+"""Top of the panel of ages, as a multiple of the maximum usable age."""
 AGE_MAX_MS: Final = 50.0
-"""Oldest usable age if the log does not tell its robot's."""
+"""Maximum usable age if the log does not contain its robot's."""
 TORQUE_DURATION_MIN_S: Final = 0.02
-"""Shorter times at the torque limit, in total, are not reported."""
+"""Shorter total times at the torque limit are not reported, s."""
 COLOURS: Final[Mapping[str, str]] = {
     "DISARMED": "idle", "HOLD": "warn", "TRACK": "good", "DAMP": "odd", "FAULT": "bad",
     "WAITING": "idle", "ALIGNING": "warn", "LEADING": "good", "OVERLOADED": "odd",
@@ -42,20 +42,20 @@ COLOURS: Final[Mapping[str, str]] = {
 """Name of the colour of each state in the bars."""
 
 Bar = tuple[float, float, str]
-"""Begin and end, s, and the name of the state."""
+"""Start and end, s, and the name of the state."""
 
 
 class Beyond(NamedTuple):
     """A limit of a line."""
 
     words: str
-    """Such as `over 20 mm while led`."""
+    """Description, such as `over 20 mm while led`."""
     shortest_s: float = 0.0
-    """A shorter time beyond it, in total, is not reported."""
+    """A shorter total time beyond it is not reported, s."""
 
 
 Beyonds = Sequence[tuple[Beyond, NDArray[np.bool_]]]
-"""Where a line is beyond its limits."""
+"""Samples of a line that are beyond each of its limits."""
 
 
 class Line(NamedTuple):
@@ -64,25 +64,25 @@ class Line(NamedTuple):
     label: str
     t: Array
     values: Array
-    """NaN where there is none."""
+    """NaN where the value is unknown."""
     colour: int
     hidden: bool = False
-    """True: not shown until the user switches it on in the legend."""
+    """True if the line is hidden until the user clicks its name in the legend."""
     dashed: bool = False
     beyond: Beyonds = ()
 
 
 class Level(NamedTuple):
-    """A limit or another level to compare the lines with."""
+    """A limit or other level to compare the lines with."""
 
     value: float
     label: str
     shown: bool = False
-    """True: the value axis extends to it."""
+    """True if the value axis extends to it."""
 
 
 class Panel(msgspec.Struct, frozen=True):
-    """What a run, or a part of it, has for a panel: lines or rows of bars."""
+    """The data of a run, or of a part of it, for a panel: lines or rows of bars."""
 
     title: str
     unit: str = ""
@@ -96,7 +96,7 @@ class Panel(msgspec.Struct, frozen=True):
 
 
 def panels_of(run: RunData) -> list[Panel]:
-    """Return all panels in the order of the page; some may have no data."""
+    """Return all panels in the order of the page; a panel may have no data."""
     return [*_body(run), _hand(run), _states(run), _ages(run), _torques(run), _certificate(run)]
 
 
@@ -112,7 +112,7 @@ def _body(run: RunData) -> Iterator[Panel]:
     def both(
         label: str, truth: Array, estimate: Array, colour: int, beyond: Beyonds = ()
     ) -> list[Line]:
-        """Return the simulated value and, hidden, the planner's estimate; or only the latter."""
+        """Return the simulated value and, hidden, the planner's estimate; or the estimate alone."""
         lines = [Line(label, t, truth, colour, beyond=beyond)] if simulated else []
         name = f"{label}, planner's estimate" if simulated else label
         return [*lines, Line(name, t_p, estimate, colour, hidden=simulated, dashed=simulated)]
@@ -148,7 +148,7 @@ def _body(run: RunData) -> Iterator[Panel]:
 
 
 def _hand(run: RunData) -> Panel:
-    """Return the operator's force, with what is carried."""
+    """Return the operator's force and the carried load."""
     title, unit = "Operator's force", "N"
     t, t_p = run.times(topics.SIM_TRUTH), run.times(topics.PLANNER_STATUS)
     if not len(t):
@@ -178,7 +178,7 @@ def _hand(run: RunData) -> Panel:
 
 
 def _states(run: RunData) -> Panel:
-    """Return the modes of planner and services, and what was done to the network."""
+    """Return the modes of planner and services, and the impairments of the network."""
     (modes,) = run.columns(topics.PLANNER_STATUS, "", "mode")
     rows = {"planner": _bars(run.times(topics.PLANNER_STATUS), modes, PlannerMode)}
     for module in MODULES:
@@ -194,7 +194,7 @@ def _states(run: RunData) -> Panel:
 
 
 def _bars(t: Array, codes: Array, names: type[Mode | PlannerMode]) -> list[Bar]:
-    """Return an interval for each time with one state; a gap ends an interval."""
+    """Return an interval for each time in one state; a gap ends an interval."""
     if not len(t):
         return []
     ends = (np.diff(codes) != 0) | (np.diff(t) > GAP_S)
@@ -217,7 +217,7 @@ def _ages(run: RunData) -> Panel:
         lines.append(Line(module, run.times(topics.JOINT_STATE, module), age_ms, number))
     most_ms = run.robot.joint_service.max_command_age_ms if run.robot is not None else AGE_MAX_MS
     return Panel(
-        "Command age", "ms", "Of the command in use, by each joint service's own clock.",
+        "Command age", "ms", "Age of the command in use, by each joint service's own clock.",
         lines=lines,
         levels=[Level(most_ms, "HOLD", shown=True)],
         reach=AGE_REACH * most_ms,
@@ -243,7 +243,7 @@ def _torques(run: RunData) -> Panel:
 
 
 def _certificate(run: RunData) -> Panel:
-    """Return the stability margins of the active gains and the least allowed margins."""
+    """Return the stability margins of the active gains, and the minimum margins."""
     t, levels, lines = run.times(topics.PLANNER_STATUS), [Level(0.0, "unstable", shown=True)], []
     least = (math.nan, math.nan)
     if run.robot is not None:
@@ -267,7 +267,7 @@ def _certificate(run: RunData) -> Panel:
 
 
 class _Judged:
-    """Times of `sim/truth` that the verdict judges, and by which limits."""
+    """Times of `sim/truth` that the verdict judges, and the limits that apply."""
 
     def __init__(self, run: RunData) -> None:
         rows = run.log.messages(topics.SIM_TRUTH)
@@ -283,7 +283,7 @@ class _Judged:
             self._led, self._held = led & judged, ~led & judged
 
     def beyond(self, values: Array, led_key: str, held_key: str = "") -> Beyonds:
-        """Return where values are beyond their limits of the verdict; an empty key: no limit."""
+        """Return where values exceed their limits of the verdict; an empty key means no limit."""
         found = []
         for key, mask, when in ((led_key, self._led, "led"), (held_key, self._held, "held")):
             if key:
@@ -294,12 +294,12 @@ class _Judged:
 
 
 def _both_signs(key: str, label: str) -> list[Level]:
-    """Return a limit of the verdict for both signs; visible once a line comes close."""
+    """Return a limit of the verdict for both signs; it shows when a line comes close."""
     most = BY_KEY[key].limit
     return [Level(most, label), Level(-most, label)]
 
 
 def _waits(run: RunData) -> NDArray[np.bool_]:
-    """Return where the planner waits: its estimates and margins are not known then."""
+    """Return where the planner waits, so that its estimates and margins are unknown."""
     (mode,) = run.columns(topics.PLANNER_STATUS, "", "mode")
     return np.asarray(mode == PlannerMode.WAITING)

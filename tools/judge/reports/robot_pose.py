@@ -1,4 +1,4 @@
-"""Pose, modes and forces of the robot over a run, for pictures of it."""
+"""Pose, modes and forces of the robot over a run, for pictures."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from shared.robot.frames import ORIGIN, UPRIGHT, FramePose, body_frames, torso_r
 from tools.logs.run_log import RunLog
 
 FORCE_MIN_N: Final = 2.0
-"""Smaller forces have no arrow, since it would show the sensor's noise."""
+"""Smaller forces have no arrow, because it would show the sensor's noise."""
 
 
 class RobotPose(NamedTuple):
     """Pose, modes and forces of the robot at one time."""
 
     t_ns: int
-    """Monotonic clock."""
+    """Stamp of the monotonic clock."""
     torso: Vector3
     """Origin of the torso frame, m, world axes."""
     angles: Vector3
@@ -43,9 +43,9 @@ class RobotPose(NamedTuple):
 
 
 def poses(log: RunLog, robot: RobotConfig, rate_hz: float) -> Iterator[RobotPose]:
-    """Yield the poses of the robot at about a rate, from the newest messages at each time.
+    """Yield poses of the robot at about a given rate, from the newest messages at each time.
 
-    The pose of the torso comes from the simulated world. In a log without one it comes from the
+    The torso pose comes from the simulated world. In a log without it, the pose comes from the
     legs' kinematics, with the planner's stance.
     """
     states: list[list[JointState]] = [log.messages(topics.JOINT_STATE, name) for name in MODULES]
@@ -56,7 +56,7 @@ def poses(log: RunLog, robot: RobotConfig, rate_hz: float) -> Iterator[RobotPose
     newest = [log.newest(topics.JOINT_STATE, name) for name in MODULES]
     wrenches, statuses = log.newest(topics.WRENCH), log.newest(topics.PLANNER_STATUS)
     kinematics = None if truth else Kinematics(robot)
-    # a service without a sample from its drive yet publishes a stamp of 0
+    # a service that has no sample from its drive yet publishes a stamp of 0
     first_ns = max(next((row.t_ns for row in rows if row.t_ns > 0), 0) for rows in states)
     for row in _at_rate(truth or states[0], max(first_ns, log.begin_ns), rate_hz):
         states_now: list[Any] = [one.at(row.t_ns) for one in newest]
@@ -80,7 +80,7 @@ def poses(log: RunLog, robot: RobotConfig, rate_hz: float) -> Iterator[RobotPose
 
 
 def _at_rate(rows: Iterable[Any], first_ns: int, rate_hz: float) -> Iterator[Any]:
-    """Yield rows from a time on, at about a rate on average, without changing their stamps."""
+    """Yield rows from a time on at about a given average rate, without changing their stamps."""
     period_ns = round(NS_PER_S / rate_hz)
     due_ns = first_ns
     for row in rows:
@@ -92,7 +92,7 @@ def _at_rate(rows: Iterable[Any], first_ns: int, rate_hz: float) -> Iterator[Any
 def pose_of_legs(
     kinematics: Kinematics, q: Sequence[float], status: PlannerStatus | None
 ) -> tuple[Vector3, Vector3, Vector3]:
-    """Return torso, angles and COM as the legs know them, with the planner's stance."""
+    """Return torso, angles and COM by the legs' kinematics, with the planner's stance."""
     if status is not None:
         kinematics.stance[:] = status.stance
     kinematics.update(np.array(q))
@@ -103,7 +103,7 @@ def pose_of_legs(
 def frames(
     robot: RobotConfig, torso: Vector3, angles: Vector3, com: Vector3, q: Sequence[float]
 ) -> list[FramePose]:
-    """Return all frames of a pose: those of the robot, and `com` with the axes of the world."""
+    """Return all frames of a pose: the robot's, and `com` with the axes of the world."""
     return [
         FramePose("world", "torso", torso, torso_rotation(angles)),
         FramePose("world", "com", com, UPRIGHT),

@@ -1,4 +1,4 @@
-"""Log of a run as arrays over one time axis."""
+"""Log of a run as arrays on one time axis."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from tools.logs.run_log import RunLog, robot_of
 
 
 class Span(NamedTuple):
-    """Time that a page shows, s."""
+    """Time range that a page shows, s."""
 
     begin: float
     end: float
 
 
 class RunData:
-    """A log or a part of one, its time axis and its robot."""
+    """A log or a part of it, its time axis and its robot."""
 
     def __init__(self, log: RunLog, zero_ns: int | None = None, span: Span | None = None) -> None:
         self.log = log
         self.course: Course | None = None
-        """Trajectory of the simulated world; None if the log has none or its scenario never
-        began."""
+        """Trajectory of the simulated world; None if the log lacks it or its scenario never
+        started."""
         self.without_course = ""
         """Reason why `course` is None."""
         try:
             self.course = verdict.course(log)
-        except XrlError as error:  # without the path of the file, since pages are shared
+        except XrlError as error:  # without the file's path, because pages are shared
             self.without_course = str(error).replace(f"{log.path}: ", "")
         self.robot: RobotConfig | None = None
-        """Configuration of the robot; None if the log holds none that this version can read."""
+        """Configuration of the robot; None if this version cannot read one from the log."""
         with contextlib.suppress(XrlError):
             self.robot = robot_of(log)
         if zero_ns is None:
@@ -62,7 +62,7 @@ class RunData:
         return (np.asarray(stamps_ns, dtype=np.int64) - self.zero_ns) / NS_PER_S
 
     def inside(self, t: Array | float) -> NDArray[np.bool_]:
-        """Return True for times of this part; False for its margins."""
+        """Return True for times of this part, False for its margins."""
         return np.asarray((t >= self._begin_s) & (t < self._end_s))
 
     @property
@@ -75,11 +75,11 @@ class RunData:
         return "time since the hoist released the robot, s"
 
     def times(self, topic: Topic, module: str = "") -> Array:
-        """Return the time of each message, s; the times do not fall.
+        """Return the time of each message, s; the times never decrease.
 
-        A message is placed at its reception if its stamp is not newer than the one before, or from
-        before the log: a joint service repeats the stamp of its drive's last sample, or publishes
-        a stamp of 0.
+        A message is placed at its reception if its stamp is from before the log, or not newer than
+        the stamp before it: a joint service repeats the stamp of its drive's last sample, or
+        publishes a stamp of 0.
         """
         found = self._times.get((topic.name, module))
         if found is None:
@@ -101,6 +101,6 @@ class RunData:
         ]
 
     def wide(self, topic: Topic, name: str, width: int, module: str = "") -> Array:
-        """Return a field of some numbers (n, width), even without messages."""
+        """Return a field of several numbers (n, width), even without messages."""
         (values,) = self.columns(topic, module, name)
         return values.reshape(-1, width)

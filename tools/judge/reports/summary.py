@@ -1,4 +1,4 @@
-"""Head and foot of a page: verdict, facts about the run, input files."""
+"""Top and bottom of a page: verdict, facts about the run, input files."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ INCOMPLETE: Final = "incomplete: the recorder did not close the file"
 
 
 class _RunVerdict(NamedTuple):
-    """Verdict on a run."""
+    """The verdict on a run, for its page."""
 
     sentence: str
     good: bool | None
-    """None: no verdict."""
+    """None if there is no verdict."""
     rows: list[tuple[str, str, str, str]]
     """(figure, measured, limit, `ok` or `over`, the latter possibly with the reason)."""
     caution: str = ""
-    """Reason not to trust the figures."""
+    """Reason to distrust the figures."""
     wearer: str = ""
-    """What it did for the person, in a line."""
+    """Effect on the wearer, in one line."""
 
 
 class Judge:
-    """Judges a run in the words of the command that made it, from its parts in their order."""
+    """Judges a run from its parts, in order, in the words of the command that made it."""
 
     def __init__(self) -> None:
         self._summaries: list[Summary] = []
@@ -48,7 +48,7 @@ class Judge:
         self._why_not = ""
 
     def add(self, run: RunData, counts: dict[str, KeyCount]) -> None:
-        """Add a run, or the next part of it; `counts` are of all messages up to its end."""
+        """Add a run, or the next part of it; `counts` cover all messages up to its end."""
         if run.course is None:
             self._why_not = self._why_not or run.without_course
             if run.robot is not None and (found := wearer_figures(run.log, run.robot)):
@@ -63,7 +63,7 @@ class Judge:
             self._why_not = str(error)
 
     def verdict(self, *, whole: bool = True) -> _RunVerdict:
-        """Return the verdict; a part of a run (`whole` is False) has figures alone."""
+        """Return the verdict; a part of a run (`whole` is False) only has figures."""
         if not self._summaries:
             said = merged_figures(self._wearer).describe() if self._wearer else ""
             return _RunVerdict(f"No verdict: {self._why_not}", None, [], wearer=said)
@@ -72,7 +72,7 @@ class Judge:
         if summary.wearer is not None:
             said = summary.wearer.describe()
         if not whole:
-            what = "A part of a run, and its figures: no verdict"
+            what = "Figures of a part of a run, without a verdict"
             return _RunVerdict(what, None, rows, wearer=said)
         text = io.StringIO()
         console = Console(file=text, width=200, color_system=None, soft_wrap=True)
@@ -85,7 +85,7 @@ class Judge:
 
 
 def _scenario_of(run: RunData) -> dict[str, Any]:
-    """Return the scenario of a run; nothing if the log has none that can be read."""
+    """Return the scenario of a run; empty if the log has no readable one."""
     try:
         return tomllib.loads(decoded(run.log.attachments.get("scenario.toml", b"")))
     except (ValueError, RecursionError):
@@ -95,7 +95,7 @@ def _scenario_of(run: RunData) -> dict[str, Any]:
 def verdict_and_facts(
     run: RunData, found: _RunVerdict, name: str, counts: dict[str, KeyCount]
 ) -> str:
-    """Return the head of the page."""
+    """Return the top of the page."""
     word = {True: "good", False: "bad", None: "none"}[found.good]
     caution = f'<p class="caution">{escape(found.caution)}</p>' if found.caution else ""
     table = ""
@@ -138,7 +138,7 @@ def _facts(run: RunData, counts: dict[str, KeyCount]) -> list[tuple[str, str]]:
         ("length", f"{end - begin:.1f} s"),
         ("file", log.path.name),
         ("recording", "; ".join(recording) or "complete"),
-        ("messages lost", f"{missing}; `xrl log info` shows which" if missing else "none"),
+        ("messages lost", f"{missing}; `xrl log info` shows the topics" if missing else "none"),
         ("git commit", about.get("git_commit", "") + changed),
         ("robot", log.robot),
         ("xrl", log.metadata.get("packages", {}).get("xrl", "")),
@@ -148,7 +148,7 @@ def _facts(run: RunData, counts: dict[str, KeyCount]) -> list[tuple[str, str]]:
 
 
 def _date(started: str) -> str:
-    """Return a readable date; the raw text if it is not in ISO format."""
+    """Return a readable date, or the raw text if it is not in ISO format."""
     try:
         return f"{datetime.fromisoformat(started):%Y-%m-%d %H:%M:%S %Z}".strip()
     except ValueError:
@@ -176,7 +176,7 @@ def _details(title: str, body: str, *, is_open: bool = False) -> str:
 def _table(
     names: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int] = ()
 ) -> str:
-    """Return a table; the columns `numbers` are set as numbers, `ok` and `over` in colour."""
+    """Return a table; `numbers` are number columns, and `ok` and `over` have colours."""
     kinds = ["n" if column in numbers else "" for column in range(len(names))]
     head = "".join(
         f'<th scope="col" class="{kind}">{escape(name)}</th>'

@@ -1,1 +1,1 @@
-"""What each part of the fleet costs: warm and cold, two revisions in turn."""
+"""Cost of each part of the fleet: warm and cold, also of two revisions in turn."""

@@ -1,4 +1,4 @@
-"""`xrl bench bus`: the fleet's pattern of messages over every transport that is installed.
+"""`xrl bench bus`: the fleet's message pattern over every installed transport.
 
 Six modules and a planner, each a process at the services' rates and priority, without their laws.
 """
@@ -45,13 +45,13 @@ dds, dds_domain, dds_topic, pub, sub, idl, dds_types = (late(f"cyclonedds.{p}") 
 Put = Callable[[bytes], object]
 Take = Callable[[], "bytes | None"]
 End = tuple[Callable[[str], Put], Callable[[str], Take]]
-"""One process's end: how to put on a key, and to take its newest payload once; neither blocks."""
+"""A process's publisher and its reader of the newest payload, by key; neither blocks."""
 
 CYCLE_NS, TICK_NS, POLL_NS = 2_000_000, 4_000_000, 400 * NS_PER_US
-WARM_UP_S: Final = 1.5  # until all links are there; not counted
+WARM_UP_S: Final = 1.5  # until all links are up; not counted
 PLANNER: Final = "planner"
 MESSAGE: Final = struct.Struct("q440x")
-"""The time at which it was put; as long as the fleet's states and commands."""
+"""Send time, padded to the size of the fleet's states and commands."""
 
 
 def _over_zenoh(process: str, folder: Path) -> End:
@@ -66,7 +66,7 @@ def _over_zenoh(process: str, folder: Path) -> End:
 
 
 def over_datagrams(_process: str, folder: Path) -> End:
-    """Join UNIX datagrams: each key's reader has a socket in the folder, and drains it."""
+    """Join UNIX datagrams: the reader of each key has a socket in the folder, and drains it."""
 
     def publisher(key: str) -> Put:
         end = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -113,12 +113,12 @@ def _over_zmq(_process: str, folder: Path) -> End:
 
 
 def _over_iceoryx2(_process: str, folder: Path) -> End:
-    """Join iceoryx2: for each key bytes in shared memory, with a buffer of one sample."""
+    """Join iceoryx2: bytes in shared memory for each key, with a buffer of one sample."""
     iox2.set_log_level(iox2.LogLevel.Fatal)
     node = iox2.NodeBuilder.new().create(iox2.ServiceType.Ipc)
 
     def service(key: str) -> Any:
-        name = iox2.ServiceName.new(f"{folder.name}/{key}")  # two runs do not meet
+        name = iox2.ServiceName.new(f"{folder.name}/{key}")  # keeps two runs apart
         builder = node.service_builder(name).publish_subscribe(iox2.Slice[ctypes.c_uint8])
         return builder.subscriber_max_buffer_size(1).enable_safe_overflow(True).open_or_create()
 
@@ -149,7 +149,7 @@ def _over_iceoryx2(_process: str, folder: Path) -> End:
 
 
 def _over_cyclonedds(_process: str, folder: Path) -> End:
-    """Join a DDS domain of the folder's own: best effort, keep last 1, UDP on the loopback."""
+    """Join a DDS domain for this folder only: best effort, keep last 1, UDP on the loopback."""
     os.environ["CYCLONEDDS_URI"] = (
         "<CycloneDDS><Domain><General><Interfaces>"
         '<NetworkInterface name="lo" multicast="false"/></Interfaces></General>'
@@ -187,12 +187,12 @@ TRANSPORTS: Final = {
     "iceoryx2": (_over_iceoryx2, "iceoryx2"),
     "cyclonedds": (_over_cyclonedds, "cyclonedds"),
 }
-"""How a process joins, and the package that it needs."""
+"""Function with which a process joins, and the package that it needs."""
 
 
 Seen = tuple[list[float], int, float]
-"""Of one process after the warm-up: us from the planner's put to the module's take of each command,
-commands that a cycle missed which could have taken them, and CPU time as a fraction of a core."""
+"""A process's figures after the warm-up: time from the planner's put to the module's take of each
+command, us; commands that missed the first possible cycle; CPU time as a fraction of a core."""
 
 
 def _run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[float], int]:
@@ -216,7 +216,7 @@ def _run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[f
 
 
 def _run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[float], int]:
-    """Put six commands once six new states are there."""
+    """Put six commands when six new states have arrived."""
     takes = [end[1](f"state_{module}") for module in MODULES]
     puts = [end[0](f"command_{module}") for module in MODULES]
     fresh, last_ns = set[int](), 0
@@ -233,7 +233,7 @@ def _run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[f
 
 
 def measure(transport: str, seconds: float) -> dict[str, float]:
-    """Run the pattern once, for so many seconds after the warm-up; return its figures."""
+    """Run the pattern once, for some seconds after the warm-up; return its figures."""
     names = (*MODULES, PLANNER)
     with (
         tempfile.TemporaryDirectory(prefix="xrl-bus-") as folder,
@@ -244,7 +244,7 @@ def measure(transport: str, seconds: float) -> dict[str, float]:
 
 
 def _run_process(transport: str, folder: str, name: str, seconds: float) -> Seen:
-    """Run one process of the pattern, and return what it saw."""
+    """Run one process of the pattern, and return its figures."""
     scheduling.raise_priority(20)
     end = TRANSPORTS[transport][0](name, Path(folder))
     gc.freeze()
@@ -257,7 +257,7 @@ def _run_process(transport: str, folder: str, name: str, seconds: float) -> Seen
 
 
 def figures(transport: str, seen: Sequence[Seen]) -> dict[str, float]:
-    """Return a transport's figures from what its seven processes saw; by heading."""
+    """Return a transport's figures, by heading, from those of its seven processes."""
     each, missed, cpu = zip(*seen, strict=True)
     latencies = np.concatenate(each)
     if not latencies.size:
@@ -268,19 +268,19 @@ def figures(transport: str, seen: Sequence[Seen]) -> dict[str, float]:
 
 
 class BusFlags(BenchFlags):
-    """Which transports, and how long."""
+    """Transports to measure, and for how long."""
 
     transport: Annotated[tuple[str, ...], Arg(choices=tuple(TRANSPORTS), metavar="NAME")] = ()
-    """measure only this one; may be repeated (default: all that are installed; those beyond Zenoh
-    and datagrams come with the extra `bench`)"""
+    """measure only this transport; may be repeated (default: all that are installed; those besides
+    Zenoh and datagrams come with the extra `bench`)"""
     seconds: Duration = 10.0
-    """of each run"""
+    """duration of each run"""
 
 
 def run(flags: BusFlags) -> int:
     """Measure the transports in turn and print their medians."""
     console = Console()
-    warn_of_others(console)  # these processes have a joint service's priority, and would hold it up
+    warn_of_others(console)  # these processes have a joint service's priority, and would delay it
     names = flags.transport or [
         name for name, (_, package) in TRANSPORTS.items() if importlib.util.find_spec(package)
     ]
@@ -297,7 +297,7 @@ def run(flags: BusFlags) -> int:
         console,
         {"": list(names)} | columns,
         "From the planner's put to a module's cycle, every 2 ms; medians of the rounds. Missed: a "
-        "command came a cycle later than it could have. CPU: of all processes, of one core.",
+        "command arrived a cycle later than possible. CPU: of all processes, in % of one core.",
     )
     write_rows(flags.json, rows)
     return 0

@@ -1,4 +1,4 @@
-"""`xrl bench fleet`: the whole fleet, led live; its record tells what it costs and achieves."""
+"""`xrl bench fleet`: leads the whole fleet live, and reads its cost and quality from the record."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tools.terminal import Console
 FIRST_USE: Final = "first_use_ms"
 """Ages of commands, which this bench reads from the record."""
 OVER_FLOOR: Final = "cpu_over_floor"
-"""CPU of the fleet over that of seven processes that only exchange its messages, `bench bus`."""
+"""CPU of the fleet relative to seven processes that only exchange its messages, `bench bus`."""
 FLOOR_S: Final = 8.0
 FIGURES: Final = {
     ("planner_tick_us", "median"): Figure("tick, median", "us", 300.0),
@@ -45,17 +45,17 @@ FIGURES: Final = {
     ("operator_peak_n",): Figure("hand's peak", "N", 40.0),
     ("alive_com_x_max_mm",): Figure("COM x, led", "mm", 20.0),
 }
-"""Figures, with the targets of docs/results.md#targets at pace 1, by their place in a run's summary
+"""Figures with the targets of docs/results.md#targets at pace 1, by their place in a run's summary
 or below `FIRST_USE`."""
 
 
 class FleetFlags(AgainstFlags):
-    """What is led."""
+    """Scenario and pace."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
-    """what happens, as of `xrl demo` (default: squat, the paper's Fig. 7)"""
+    """scenario, as for `xrl demo` (default: squat, the paper's Fig. 7)"""
     pace: Annotated[float, Range(PACE_MIN, 1.0, ""), Arg(metavar="X")] = 1.0
-    """clock rate of the fleet; it is not lowered on full cores, and the targets are those of 1"""
+    """clock rate of the fleet; it is not lowered on full cores, and the targets are for 1"""
 
 
 def run(flags: FleetFlags) -> int:
@@ -74,7 +74,7 @@ def run(flags: FleetFlags) -> int:
     ]
     note = (
         "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
-        "Age: of a command, from the module's state that it answers to the cycle that takes it. "
+        "Age: of a command, from the state that it echoes to the cycle that takes it. "
         "Messages alone: `xrl bench bus --transport zenoh`, without laws, drives and a recorder."
     )
     return finish(flags, [row_of(figure, here, there) for figure in kept], note, console)
@@ -96,7 +96,7 @@ def measure(demo: Sequence[str]) -> Turn:
 
 
 def figures(summary: Mapping[str, Any], first_use: Array) -> Turn:
-    """Return a run's figures, from its summary.json and `first_use_ms`; None if one is unknown."""
+    """Return a run's figures, from its summary.json and `first_use_ms`; None if unknown."""
     ages: dict[str, float] = {}
     if first_use.size:
         ages["median"], ages["p99"] = np.percentile(first_use, [50.0, 99.0]).tolist()
@@ -110,8 +110,8 @@ def figures(summary: Mapping[str, Any], first_use: Array) -> Turn:
 def first_use_ms(log: RunLog) -> Array:
     """Return the age of each command in the cycle that took it, ms, of all modules: (n,) floats.
 
-    The age counts from the module's state that the command echoes. Commands to hold are left out,
-    and those that the log does not have.
+    The age counts from the module's state that the command echoes. Commands to hold, and commands
+    that are missing in the log, are left out.
     """
     ages = []
     for module in MODULES:

@@ -1,9 +1,9 @@
-"""The parts of the fleet that `xrl bench` times, each fed with what a recorded squat gave it.
+"""The parts of the fleet that `xrl bench` times, each with its inputs from a recorded squat.
 
 A loop that calls a function a thousand times in a row finds its code and data in the cache. In the
 fleet each cycle follows a sleep, and ten processes share two cores: a planner tick of 294 us warm
-cost 568 us live. A cold call sweeps more memory than a core's own cache holds, and sleeps, before;
-that reproduced the live figure. Times are the calling thread's CPU time.
+took 568 us live. Before a cold call the bench sweeps more memory than a core's own cache holds, and
+sleeps; that reproduced the live figure. Times are the calling thread's CPU time.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ from tools.sim.lockstep import Lockstep, begin_standing, forget
 from tools.sim.recorded_lockstep import DRAIN_EVERY, RecordedMessages
 
 SECONDS: Final = 3.0
-"""Recorded of the squat: on the way down and up."""
+"""Recorded part of the squat, down and up, s."""
 PIECE_S: Final = 0.5
-"""Virtual time of a lockstep run that makes one figure, s."""
+"""Virtual time of a lockstep run for one figure, s."""
 BATCH: Final = 64
-"""Messages that the recorder takes in one cycle of 12 ms."""
+"""Messages per batch, as the recorder takes in one cycle of 12 ms."""
 MODULE: Final = "knee_right"
 
 
 SWEPT_BYTES: Final = 6 << 20
 """Read and written before each cold call."""
 ASLEEP_S: Final = 1.5e-3
-"""Sleep before each cold call: most of a joint service's cycle."""
+"""Sleep before each cold call, s: most of a joint service's cycle."""
 CALLS: Final = {"warm": 200, "cold": 60}
-"""Calls of a turn: a few tenths of a second."""
+"""Calls per turn: a few tenths of a second."""
 YARDSTICK_CALLS: Final = 20
 
 
 class Repeated(NamedTuple):
-    """Something to measure."""
+    """A call to measure."""
 
     once: Callable[[], object]
-    """The call that is timed."""
+    """The timed call."""
     before: Callable[[], object] | None = None
     """Prepares each call, untimed."""
 
@@ -92,21 +92,21 @@ class JointInputs(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """A squat in virtual time, as each part met it."""
+    """A squat in virtual time, with the inputs of each part."""
 
     robot: RobotConfig
     ticks: list[tuple[int, list[JointState]]]
-    """Time of each planner tick, ns, and the six states that it used."""
+    """Time of each planner tick, ns, and the six states that the tick used."""
     cycles: list[JointInputs]
     """Cycles of `MODULE`'s service."""
     messages: list[tuple[Topic, str, Message]]
-    """All that the recorder would get."""
+    """All messages for the recorder."""
     fleet: Lockstep
-    """As the recording left it."""
+    """The fleet after the recording."""
 
 
 def record(robot: RobotConfig, scenario: Scenario) -> Recorded:
-    """Run the fleet in virtual time and keep what its parts were given."""
+    """Run the fleet in virtual time and keep the inputs of its parts."""
     latest: dict[str, JointState] = {}
     ticks: list[tuple[int, list[JointState]]] = []
     messages: list[tuple[Topic, str, Message]] = []
@@ -135,7 +135,7 @@ def record(robot: RobotConfig, scenario: Scenario) -> Recorded:
 
 
 class _KeptManager(DriveManager):
-    """A joint service that keeps what it was given."""
+    """A drive manager that keeps its inputs."""
 
     def __init__(self, config: RobotConfig, name: str) -> None:
         super().__init__(config, name)
@@ -169,7 +169,7 @@ def _planner_tick(recorded: Recorded, _stack: ExitStack, split: str = "certified
 
 
 def _joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
-    """A command's JSON and a sample in, a target and every other cycle a state's JSON out."""
+    """A command's JSON and a sample in; a target and, every other cycle, a state's JSON out."""
     manager, decoder = DriveManager(recorded.robot, MODULE), Decoder(JointCommand)
     arguments = [one.arguments for one in recorded.cycles]
     payloads = [b"" if command is None else encode(command) for _, _, command, *_ in arguments]
@@ -221,7 +221,7 @@ def _simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
 
 
 def _recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
-    """`BATCH` messages from the bus to the file."""
+    """Write `BATCH` messages from the bus to the file."""
     writer = _writer(recorded.robot, stack)
     outbox, messages = RecordedMessages(recorded.robot.name), itertools.cycle(recorded.messages)
 
@@ -233,7 +233,7 @@ def _recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
 
 
 def yardstick(_recorded: Recorded, _stack: ExitStack) -> Repeated:
-    """`YARDSTICK_CALLS` solutions of a 12 x 12 system: how fast the machine is at this moment."""
+    """`YARDSTICK_CALLS` solutions of a 12 x 12 system: the machine's present speed."""
     A = np.eye(12) + 0.01 * np.arange(144.0).reshape(12, 12) / 144.0
     b = np.ones(12)
 
@@ -253,9 +253,9 @@ class Part(NamedTuple):
     name: str
     prepare: Prepare
     warm_us: float | None = None
-    """Target of the CPU time, warm, in the median; None: none."""
+    """Target of the median warm CPU time, us, or None."""
     cold_us: float | None = None
-    """The same, cold."""
+    """Target of the median cold CPU time, us, or None."""
 
 
 PARTS: Final = (
@@ -281,17 +281,17 @@ FIGURES: Final = (
 
 
 class Bench:
-    """The parts of a robot, prepared once."""
+    """The parts of a robot, prepared once for all turns."""
 
     def __init__(self, robot: RobotConfig, squat: Scenario, stack: ExitStack) -> None:
-        """Run a squat in virtual time and prepare every part with what it met."""
+        """Run a squat in virtual time and prepare every part with its inputs."""
         recorded = record(robot, squat)
         self._parts = {part.name: part.prepare(recorded, stack) for part in PARTS}
         self._robot, self._squat = robot, squat
         self._writer = _writer(robot, stack)
 
     def turn(self) -> Turn:
-        """Return each part's cost, us, and the speeds of lockstep, times real time."""
+        """Return the cost of each part, us, and the speeds of lockstep, times real time."""
         found: Turn = {
             name: _lockstep_speed(self._robot, self._squat, self._writer if record else None)
             for name, record in zip(LOCKSTEP, (False, True), strict=True)
@@ -305,7 +305,7 @@ class Bench:
 def _lockstep_speed(robot: RobotConfig, scenario: Scenario, writer: RunWriter | None) -> float:
     """Return how many times faster than real time one core runs the scenario's first `PIECE_S`.
 
-    To stand up is not measured. With a writer the run is recorded.
+    Standing up is not measured. With a writer the run is recorded.
     """
     outbox = RecordedMessages(robot.name)
     take = forget if writer is None else outbox.put

@@ -1,4 +1,4 @@
-"""Tables of `xrl bench`: medians of turns, ratios to another revision, targets; and their flags."""
+"""Tables of `xrl bench`: medians of turns, ratios to another revision, targets; and the flags."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from tools.judge.verdict_table import digits
 from tools.terminal import Console, marked
 
 PATIENCE_S: Final = 600.0
-"""Timeout for one turn of another tree, or one run of a fleet."""
+"""Timeout for one turn of another tree, or one run of a fleet, s."""
 ENDING_S: Final = 30.0
-"""Timeout for an interrupted run to end its fleet."""
+"""Timeout for an interrupted run to end its fleet, s."""
 Turn: TypeAlias = dict[str, float | None]
-"""A turn's figures by name; None if it has none."""
+"""A turn's figures by name; None for a missing one."""
 
 
 class Figure(NamedTuple):
@@ -41,7 +41,7 @@ class Figure(NamedTuple):
 
     what: str
     unit: str
-    """`x`: a speed, which is to be high; anything else is to be low."""
+    """`x` marks a speed, where higher is better; for all other units lower is better."""
     target: float | None = None
 
 
@@ -51,18 +51,18 @@ class Row(NamedTuple):
     what: str
     unit: str
     value: float | None
-    """Median of the turns; None if no turn has it."""
+    """Median of the turns; None if no turn has the figure."""
     spread: tuple[float, float] | None
-    """Least and most of the turns."""
+    """Minimum and maximum of the turns."""
     other: float | None = None
     """The other revision's median."""
     ratio: float | None = None
-    """This time over the other's, turn by turn, in the median; below 1 this tree is faster."""
+    """Median over the turns of this time divided by the other; below 1 this tree is faster."""
     target: float | None = None
 
     @property
     def ok(self) -> bool:
-        """True unless the target is missed."""
+        """False if the target is missed."""
         if self.target is None or self.value is None:
             return True
         return self.value >= self.target if self.unit == "x" else self.value <= self.target
@@ -91,24 +91,24 @@ def row_of(figure: Figure, here: Sequence[Turn], there: Sequence[Turn]) -> Row:
 
 
 def _writable(text: str) -> Path:
-    """Return a file's path; refused before minutes of measuring are lost to it."""
+    """Return a file's path; refuse a bad one before minutes of measuring are lost."""
     file = Path(text)
     if file.is_dir() or not file.parent.is_dir():
-        raise argparse.ArgumentTypeError(f"{text[:200]!r}: name a file in a folder that exists")
+        raise argparse.ArgumentTypeError(f"{text[:200]!r}: must be a file in an existing folder")
     return file
 
 
 class BenchFlags(Flags):
-    """How often, and where the figures go."""
+    """Number of rounds, and where the figures go."""
 
     rounds: Annotated[Count | None, Arg(metavar="N")] = None
-    """rounds of each (default: 9 for the parts, 3 else)"""
+    """rounds of each (default: 9 for the parts, else 3)"""
     json: Annotated[Path | None, parsed(_writable, "FILE")] = None
     """also write the figures to this file"""
 
 
 class AgainstFlags(BenchFlags, ConfigFlags):
-    """A tree, and one to compare it with."""
+    """A tree to measure, and a tree to compare it with."""
 
     against: Annotated[str | None, Arg(metavar="REV")] = None
     """also measure a git revision by its own bench, in turn with this tree, and print the ratios;
@@ -123,10 +123,10 @@ def run_turns(
     measure: Callable[[], Turn],
     console: Console,
 ) -> tuple[list[Turn], list[Turn]]:
-    """Return the turns of this tree, and of the one of `--against`, which take turns.
+    """Return the turns of this tree, and those of the tree of `--against`, measured alternately.
 
     `measure` makes one turn of this tree; `words` are the verb with its flags, for a tree that
-    runs in a process of its own.
+    runs in its own process.
     """
     each = track(range(rounds), "measuring", console=console, transient=True)
     if flags.against is None:
@@ -138,7 +138,7 @@ def run_turns(
 
 
 def _turn_of(tree: Path, words: Sequence[str], config: Path) -> Turn:
-    """Return one turn of a tree's own bench, with its version of a robot file of this checkout."""
+    """Return one turn of a tree's own bench, with its own version of this checkout's robot file."""
     config = config.resolve()
     if config.is_relative_to(CHECKOUT):
         config = tree / config.relative_to(CHECKOUT)
@@ -153,7 +153,7 @@ def unpacked(revision: str) -> Iterator[Path]:
     """Yield a folder with the tree of a git revision.
 
     Raises:
-        RunError: this is no checkout, git is missing, or it knows no such revision.
+        RunError: this is not a checkout, git is missing, or it does not know the revision.
     """
     need_checkout("--against")
     with tempfile.TemporaryDirectory(prefix="xrl-bench-") as name:
@@ -165,19 +165,19 @@ def unpacked(revision: str) -> Iterator[Path]:
             raise RunError("git is missing; --against needs it to read a revision") from None
         if done.returncode:
             reason = " ".join(done.stderr.strip().splitlines()[-1:])
-            raise RunError(f"{revision}: no git revision here ({reason}); such as HEAD~1")
+            raise RunError(f"{revision}: no such git revision ({reason}); try one such as HEAD~1")
         with tarfile.open(archive) as packed:
-            packed.extractall(tree)  # noqa: S202 - git's own
-        with suppress(RunError):  # CasADi then interprets its law
+            packed.extractall(tree)  # noqa: S202 - the archive is git's own
+        with suppress(RunError):  # without the libraries CasADi interprets its law
             run_tree(tree, [], "tools.graph_libraries")
         yield tree
 
 
 def run_tree(tree: Path, words: Sequence[str], module: str = "tools.cli") -> str:
-    """Run `xrl`, or another module, of a source tree; return its output. Ctrl-C reaches it as well.
+    """Run `xrl`, or another module, of a source tree; return its output. It also receives Ctrl-C.
 
     Raises:
-        RunError: it ended with an error, or not in time.
+        RunError: it ended with an error, or timed out.
     """
     process = subprocess.Popen(
         [sys.executable, "-m", module, *words],
@@ -199,14 +199,14 @@ def run_tree(tree: Path, words: Sequence[str], module: str = "tools.cli") -> str
 
 
 def finish(flags: AgainstFlags, rows: Sequence[Row], note: str, console: Console) -> int:
-    """Print and write the rows; return the exit code, with --strict that of a missed target."""
+    """Print and write the rows; return the exit code, with --strict a fault for a missed target."""
     columns: dict[str, list[Any]] = {
         "": [row.what for row in rows],
         "here": [_cell(row.value, row.unit) for row in rows],
     }
     if flags.against is None:
         spreads = (() if row.spread is None else map(digits, row.spread) for row in rows)
-        columns["least .. most"] = [" .. ".join(spread) for spread in spreads]
+        columns["min .. max"] = [" .. ".join(spread) for spread in spreads]
     else:
         columns[flags.against] = [_cell(row.other, row.unit) for row in rows]
         columns["ratio"] = ["" if row.ratio is None else f"{row.ratio:.2f}" for row in rows]
@@ -227,7 +227,7 @@ def _cell(value: float | None, unit: str) -> str:
 
 
 def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], note: str) -> None:
-    """Print cells by heading, those of no heading to the left, and a note below them."""
+    """Print cells by heading, left-aligned without a heading, and a note below them."""
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in columns:
         shown.add_column(heading, justify="right" if heading else "left", no_wrap=True)
@@ -238,6 +238,6 @@ def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], n
 
 
 def write_rows(file: Path | None, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write a table's rows to the file of `--json`, if there is one."""
+    """Write a table's rows to the file of `--json`, if given."""
     if file is not None:
         replace_file(file, json.dumps(rows, indent=2).encode() + b"\n")

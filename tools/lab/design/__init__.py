@@ -1,1 +1,1 @@
-"""Design of the gains by `xrl gains`: their schedule, its certificates, what pushes they bear."""
+"""Design of the gains by `xrl gains`: their schedule, certificates, and withstood pushes."""

@@ -1,7 +1,7 @@
 """Computes the body stiffness needed to balance, from the paper's section IV. Pure.
 
-The robot leans as an inverted pendulum of mass m and height z_max over two ankles. The ankles do
-not count towards m, because they stand still:
+The robot leans as an inverted pendulum of mass m and height z_max over two ankles. The ankles are
+not part of m, because they do not move:
 
     theta_max  = arcsin(2 tau_max / (m g z))     the ankles' torque is used up
     theta_edge = arctan(half sole / z)           the COM is over the sole's edge
@@ -10,8 +10,8 @@ not count towards m, because they stand still:
     K_x_min    = 2 K_ank_min / z^2               N/m, in the body's coordinates
     K_x(tau)   = 2 tau_max / (theta_edge z^2)    uses tau_max at the edge
 
-The paper's formula for theta_edge prints l_foot, but its text and its number (2.81 deg) take w_foot
-/ 2. Here x takes the one and y the other.
+The paper's formula for theta_edge prints l_foot, but its text and its number (2.81 deg) use w_foot
+/ 2. Here x uses l_foot and y uses w_foot.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class BodyStiffness(NamedTuple):
     K_min: float
     """N/m"""
     K_tau_max: float
-    """N/m; with it the ankles give tau_max at the sole's edge."""
+    """N/m; with it the ankles produce tau_max at the sole's edge."""
 
 
 def for_robot(config: RobotConfig) -> dict[str, BodyStiffness]:
-    """Return the least body stiffness that balances along x and y, upright with straight legs.
+    """Return the minimum body stiffness that balances along x and y, upright with straight legs.
 
-    The soles stand side by side: x uses half their length, y half their width. The legs' spread
-    helps in y and is left out, as in the paper.
+    The soles are side by side: x uses half their length, y half their width. As in the paper, the
+    distance between the legs, which helps in y, is left out.
     """
     geometry, tau_max = config.geometry, config.joint.tau_module_max
     height = geometry.l1 + geometry.l2

@@ -10,8 +10,8 @@ robot file:
 - in HOLD with the services, and with the drives alone;
 - on request, parked: as in TRACK, but height and pitch are closed, and nothing may drift.
 
-While an encoder is blind, which its drive says only after `BLIND_S`, a motion may grow, by
-`BLIND_GROWTH_MAX` at most until then.
+While an encoder is blind, which its drive reports only after `BLIND_S`, a motion may grow, by
+at most `BLIND_GROWTH_MAX` until then.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from tools.lab.design.sampled_loop import (
 DELAY_MIN_S: Final = 2e-3
 """s, from a sample to the first use of its command, over a bus without delay."""
 DRIVE_STEP_S: Final = 1e-3
-"""s. The drives' loop is modelled as slow as the simulated one; the firmware's 8 kHz is less
+"""s. The modelled drive loop is as slow as the simulated one; the firmware's 8 kHz is less
 critical."""
 DRIFT_HZ: Final = 0.05
-"""A slower motion is no oscillation but a drift: the leading operator is part of that loop."""
+"""A slower motion is a drift, not an oscillation: the leading operator closes that loop."""
 HALF_NAMES: Final = ("fore and aft", "sideways", "all directions")
 TRACK: Final = ("TRACK",)
 PARKED: Final = ("parked",)
@@ -63,18 +63,18 @@ BLIND: Final = tuple(
     f"HOLD, {MODULES[i // 3]} with {('no encoder', 'one encoder', 'the other encoder')[i % 3]}"
     for i in range(3 * N_LEG // 2)
 )
-"""Modes: modules of one leg, each with both axes blind, and with either."""
+"""Modes: modules of one leg, each with both axes blind, and with either axis blind."""
 BLIND_S: Final = 0.051
-"""s; so long an axis stays armed and blind (docs/drives.md)."""
+"""Time for which an axis stays armed and blind, s (docs/drives.md)."""
 BLIND_GROWTH_MAX: Final = 1.5
-"""Factor on a motion in `BLIND_S`."""
+"""Factor by which a motion may grow within `BLIND_S`."""
 SEEN: Final = (
     np.zeros((2, 2)),
     0.5 * np.array([[1.0, 1.0], [1.0, 1.0]]),
     0.5 * np.array([[1.0, -1.0], [-1.0, 1.0]]),
 )
-"""What (phi, theta) a module measures, per (phi, theta): with both motors blind, and with either:
-docs/law.md (3)."""
+"""Measured (phi, theta) of a module per (phi, theta), with both motors blind and with either one
+blind: docs/law.md (3)."""
 
 
 class Design(NamedTuple):
@@ -107,7 +107,7 @@ class Condition(NamedTuple):
     hand: HandModel
     gains: Gains
     integral: bool = True
-    """False: F_I is at its limit, and stays there."""
+    """False if F_I is at its limit and stays there."""
 
     def words(self) -> str:
         """Return a description of the case."""
@@ -133,7 +133,7 @@ class _DynamicVerdict(NamedTuple):
     growth: Growth
     condition: Condition
     excess: float
-    """1/s: the growth rate, minus the rate allowed for a drift."""
+    """Growth rate minus the rate allowed for a drift, 1/s."""
 
     @property
     def stable(self) -> bool:
@@ -168,7 +168,7 @@ def nodes_of(
 def stands_of(config: RobotConfig, poses: Poses, node: PoseNode, M: Array) -> list[Stand]:
     """Return the last of the poses, a node, linearised without and with the full assist.
 
-    M (6, 6) is the inertia along p there (`services.planner.law.model.BodyInertia`).
+    M (6, 6) is the inertia along p at the node (`services.planner.law.model.BodyInertia`).
     """
     J, J_harness = poses.kinematics.J.copy(), poses.kinematics.J_harness.copy()
     S = np.array(config.law.S, float)
@@ -214,7 +214,7 @@ class DynamicCertificate:
         )
 
     def held(self, node: StiffnessNode, design: Design, *, onboard: bool) -> Feedback:
-        """Return the feedback in HOLD, of the services or of the drives alone (`onboard`)."""
+        """Return the feedback in HOLD, from the services or from the drives alone (`onboard`)."""
         k_p, k_d = self._hold
         D, D_B = np.maximum(node.D, k_p), np.maximum(np.tile(design.D_B, 2), k_d)
         if onboard:
@@ -260,7 +260,7 @@ class DynamicCertificate:
         *,
         stop_above: float = np.inf,
     ) -> _DynamicVerdict:
-        """Return the condition with the slowest decay, or the first excess above so much, 1/s."""
+        """Return the condition with the slowest decay, or the first above `stop_above`, 1/s."""
         worst: _DynamicVerdict | None = None
         for condition in self.conditions(modes):
             verdict = self.judge(condition, design)
@@ -338,7 +338,7 @@ class DynamicCertificate:
 
 
 def _seen(mode: int) -> Array:
-    """Return what the joints (12,) measure per joint angle in a mode of `BLIND`, by its index."""
+    """Return the joints' measurements (12,) per joint angle in a mode of `BLIND`, by its index."""
     seen, first = np.eye(N_JOINTS), 2 * (mode // len(SEEN))
     seen[first : first + 2, first : first + 2] = SEEN[mode % len(SEEN)]
     return seen

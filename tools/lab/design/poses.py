@@ -1,6 +1,6 @@
 """Standing poses over COM height and pitch: inputs of the certificates, bounds of the commands.
 
-Offline. The joint services check commands against the bounds.
+This runs offline. The joint services check commands against the bounds.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ MID_HEIGHT_FRACTION: Final = 0.8
 """Fraction of the straight leg: height of the pose from which every other pose is approached."""
 
 BODY_RATES: Final = (0.3, 0.3, 1.0, 0.5, 2.0, 0.5)
-"""m/s and rad/s along p; a faster motion is no lead but a fall. A squat led by a person has 0.3
-m/s."""
+"""m/s and rad/s along p; a faster motion is a fall, not a lead. A squat led by a person reaches
+0.3 m/s."""
 THETA_BINS: Final = 12
 """Bins of a joint's range of theta."""
 KINDS: Final = {kind_of(module): 2 * i for i, module in enumerate(MODULES[: N_LEG // 2])}
@@ -127,7 +127,7 @@ class Poses:
 
 
 class BoundsOverPoses:
-    """Collects the bounds while the schedule is computed; both legs are alike."""
+    """Collects the bounds while the schedule is computed; both legs have the same."""
 
     def __init__(self, config: RobotConfig) -> None:
         """Start with the stand gains only."""
@@ -168,7 +168,7 @@ class BoundsOverPoses:
         }
 
     def _by_theta(self, column: int) -> tuple[Bounds, ...]:
-        """Return the bounds of tau_ff per bin of theta, each including the bins beside it."""
+        """Return the bounds of tau_ff per bin of theta, each including its neighbouring bins."""
         theta, tau = np.array(self._q)[:, column + 1], np.array(self._tau_ff)
         edges = np.linspace(*_rounded(theta), THETA_BINS + 1)
         width = edges[1] - edges[0]

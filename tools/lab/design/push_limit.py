@@ -3,19 +3,19 @@
 The stiffness certificate (`services.planner.law.certificate`) is linear and has no limits. This
 module adds them, for a constant horizontal push F u at the torso's origin:
 
-1. Limit of the gains. Local gains D hold with references at rest; while the planner is engaged,
-   K_c acts beside them (`services.planner.law.coupling`). The body moves by dp, the torques change:
+1. Limit of the gains. The local gains D hold with constant references; while the planner is
+   engaged, K_c acts too (`services.planner.law.coupling`). The body moves by dp, torques change:
 
        (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
 
-   Led, a push that grew slowly leaves no error along y up to `law.push_integral_max`.
+   While led, a slowly growing push leaves no error along y up to `law.push_integral_max`.
 
-2. Limit of the body, whatever the control does, at fixed joint angles. A linear program chooses how
-   the two legs share weight and push. No gains hold a harder push at that pose.
+2. Limit of the body, under any control, at fixed joint angles. A linear program chooses how the
+   two legs share weight and push. No gains withstand a larger push at that pose.
 
 Leg i carries the torso wrench W_i: tau_i = J_i^T W_i + the torque of its knee's weight. Its sole
 carries W_i moved to the ankle, plus the leg's weight. J_i^T dW_i = dtau_i - (H T dp)_i. Every limit
-is linear in tau and in the soles' wrenches, so the first limit reached sets the force.
+is linear in tau and in the soles' wrenches, so the first limit that is reached sets the force.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ FRICTION: Final = 0.5
 DIRECTIONS: Final = {"forwards": (1.0, 0.0), "back": (-1.0, 0.0), "sideways": (0.0, 1.0)}
 """World x and y of each push. Left and right are symmetric."""
 RIGID: Final = 1e9
-"""N/m; an integral leaves no error."""
+"""N/m; models an integral, which leaves no error."""
 _SLOPE_MIN: Final = 1e-12
 _LEGS: Final = (slice(0, N_LEG), slice(N_LEG, N_JOINTS))
 
 
 class _PushLimit(NamedTuple):
-    """The hardest push along one direction."""
+    """The largest push along one direction."""
 
     force_n: float
     """0 if the pose does not stand even without a push."""
@@ -59,20 +59,20 @@ class _PushLimit(NamedTuple):
 
 
 class PushLimits(NamedTuple):
-    """The hardest constant push along one direction, for each set of active controllers."""
+    """The largest constant push along one direction, for each set of active controllers."""
 
     led: _PushLimit
-    """TRACK: joint services and planner; a push that has grown slowly."""
+    """TRACK: joint services and planner; the push grows slowly."""
     held: _PushLimit
     """HOLD: joint services only, the planner is dead."""
     drives: _PushLimit
-    """Drives only, the joint services are dead as well."""
+    """Drives only, the joint services are dead too."""
     body: _PushLimit
     """Limit of soles and motors under any control."""
 
 
 class Response(NamedTuple):
-    """Change caused by a push of 1 N, once the body has come to rest."""
+    """Change caused by a push of 1 N, after the body has come to rest."""
 
     dp: Array
     """(6,) m and rad."""
@@ -99,7 +99,7 @@ class LoadedStand:
     def __init__(self, config: RobotConfig, kinematics: Kinematics, T: Array, H: Array) -> None:
         """Compute the loads of the pose at which the kinematics was updated.
 
-        T (12, 6) are joint rates per unit of p along the closed chain, H (12, 12), N m/rad, is
+        T (12, 6) are joint rates per unit of p along the closed chain. H (12, 12), N m/rad, is
         `Kinematics.hessian_times` of the weight.
         """
         self._T, self._H = T.copy(), H.copy()
@@ -123,8 +123,8 @@ class LoadedStand:
         ankles = ankle_positions(config) + np.outer((0.5, -0.5), kinematics.stance[:3])
         self._arms = [kinematics.r_torso - ankle for ankle in ankles]
         self._leg_weights = [
-            # the knee's weight turns the ankle with the moment that the ankle's torques
-            # show
+            # the knee's weight turns the ankle with a moment equal to the ankle's torques
+            # from it
             np.array([0.0, 0.0, config.leg_weight, *self._tau_knees[leg][:2], 0.0])
             for leg in _LEGS
         ]
@@ -142,7 +142,7 @@ class LoadedStand:
     def response(
         self, D: Array, direction: tuple[float, float], K_c: Array | None = None
     ) -> Response | None:
-        """Return the response to a constant push of 1 N; None if the gains do not stand at all.
+        """Return the response to a constant push of 1 N, or None if the gains cannot stand.
 
         Args:
             D: local stiffnesses (12,), N m/rad. With drivetrain stiffness k, pass D k / (D + k).
@@ -173,16 +173,16 @@ class LoadedStand:
     def limit_held(
         self, D: Array, direction: tuple[float, float], K_c: Array | None = None
     ) -> _PushLimit:
-        """Return the hardest constant push that the gains hold; arguments as for `response`."""
+        """Return the largest constant push that the gains hold; arguments as for `response`."""
         response = self.response(D, direction, K_c)
         return self._hardest(response, np.zeros(2 * N_JOINTS))
 
     def limit_led(
         self, D: Array, direction: tuple[float, float], K_c: Array, integral_max: float
     ) -> _PushLimit:
-        """Return the hardest push that gains and integral hold, which grew slowly.
+        """Return the largest slowly growing push that gains and integral hold.
 
-        Arguments as for `response`; `integral_max` is of F_I, N; 0: there is none
+        Arguments as for `response`; `integral_max` is the limit of F_I, N, 0 without F_I
         (`services.planner.law.coupling`).
         """
         rigid = np.zeros((6, 6))
@@ -199,7 +199,7 @@ class LoadedStand:
         return beyond._replace(force_n=until_n + beyond.force_n)
 
     def _hardest(self, response: Response | None, borne: Array) -> _PushLimit:
-        """Return the hardest push on top of what torques and soles (24,) bear already."""
+        """Return the largest push in addition to the present load of torques and soles (24,)."""
         if response is None:
             return _PushLimit(0.0, "the stiffness")
         before = borne + np.concatenate((self._tau, self._soles(self._W)))
@@ -213,10 +213,10 @@ class LoadedStand:
         return hardest
 
     def limit_of_body(self, direction: Sequence[float], limp: str = "") -> _PushLimit:
-        """Return the hardest push that soles and motors bear at this pose under any control.
+        """Return the largest push that soles and motors withstand at this pose under any control.
 
-        The direction is world x and y, a unit vector; or a wrench on the torso (6,), N and N m: the
-        limit is then in times of it. The motors of the module `limp` have no torque.
+        The direction is world x and y, a unit vector; or a wrench on the torso (6,), N and N m, and
+        the limit is then a multiple of it. The motors of the module `limp` have no torque.
         """
         total, unit = self._W[0] + self._W[1], np.pad(direction, (0, 6 - len(direction)))
 
@@ -256,7 +256,7 @@ class LoadedStand:
 
 
 def stand_at(config: RobotConfig, poses: Poses, z: float, pitch: float) -> LoadedStand | None:
-    """Return the stand at a COM height, m, and a pitch, rad; None if it cannot be reached."""
+    """Return the stand at a COM height, m, and a pitch, rad, or None if out of reach."""
     node = poses.node(z, pitch)
     if node is None:
         return None

@@ -17,8 +17,8 @@ The controllers run on it, each at its own rate:
 
 One planner period is a linear map. The loop is stable if the map's spectral radius is below 1.
 
-A standing pose is symmetric, left to right. Its quantities therefore split into a sagittal half (x,
-z, pitch) and a lateral one (y, roll, yaw): `halves`.
+A standing pose is symmetric, left to right. The loop therefore splits into a sagittal half (x, z,
+pitch) and a lateral half (y, roll, yaw): `halves`.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ class HandModel(NamedTuple):
 
 
 MOVES_MIN: Final = 1e-9
-"""Largest gain of an integral that is none."""
+"""An integral with a smaller gain is left out."""
 ROUNDING: Final = 1e-12
-"""Singular values below so much of the largest are none."""
+"""Singular values below this fraction of the largest count as zero."""
 NO_HAND: Final = HandModel(0.0, 0.0, 0.0, 0.0)
 
 
@@ -104,14 +104,14 @@ class Feedback(NamedTuple):
     easing_bandwidth_hz: float = 40.0
     """Bandwidth of the pole on the hand's measured wrench."""
     integral: Array = np.zeros(N_JOINTS)
-    """(12,): row of J whose error is integrated; 0: none."""
+    """(12,): row of J whose error is integrated, or zeros."""
     integral_gain: float = 0.0
     """N/(m s)"""
     seen: Array = np.eye(N_JOINTS)
-    """(12, 12): the local loops see `seen` q; the identity, but while an encoder is blind."""
+    """(12, 12): the local loops measure `seen` q; the identity unless an encoder is blind."""
     lifts: float = 0.0
-    """N/s per metre by which a parked robot's assist rises below its height. Above 0 the assist
-    also follows the hand's force, and nothing is eased (`services.planner.watch.park`)."""
+    """N/s per metre: rate at which a parked robot's assist rises below its height. Above 0 the
+    assist also follows the hand's force, and nothing is eased (`services.planner.watch.park`)."""
 
 
 class Gains(NamedTuple):
@@ -120,7 +120,7 @@ class Gains(NamedTuple):
     coupling: float = 1.0
     """On tau_coupled."""
     torque: float = 1.0
-    """On every torque that is feedback."""
+    """On every feedback torque."""
 
 
 NOMINAL: Final = Gains()
@@ -177,7 +177,7 @@ def whole() -> Half:
 
 
 class _Laws(NamedTuple):
-    """What services, planner and hand do, in the coordinates of a half."""
+    """Laws of services, planner and hand, in the coordinates of a half."""
 
     D: Array
     D_B: Array
@@ -185,26 +185,26 @@ class _Laws(NamedTuple):
     D_Bm: Array
     """Means over the motors of a module, as in the drives' law."""
     coupled: Array
-    """(n, n_c) orthonormal basis of tau_coupled: filters and commands hold its coordinates."""
+    """(n, n_c) orthonormal basis of tau_coupled; filters and commands contain its coordinates."""
     C_q: Array
     C_v: Array
     """(n_c, n)"""
     H: Array
     J_open: Array
     T_open: Array
-    """J and T of the coordinates that the planner takes as measured."""
+    """J and T of the coordinates in which the planner uses the measured values."""
     ease_p: Array
     ease_v: Array
-    """(n_c, n_p): part of tau_coupled that eases the hand's force, or the assist that follows it,
-    per p and p'."""
+    """(n_c, n_p): part of tau_coupled that eases the hand's force, or the assist that follows the
+    force, per p and p'."""
     integral: Array
-    """(1, n): the row of J that is integrated; (0, n) where there is none."""
+    """(1, n): the integrated row of J; (0, n) without one."""
     integrated: Array
     """(n_c, 1), or (n_c, 0): tau_coupled per F_I."""
 
 
 class _State(NamedTuple):
-    """Places of plant and estimator in the state."""
+    """Positions of plant and estimator in the state."""
 
     p: slice
     pd: slice
@@ -223,7 +223,7 @@ class _Step(NamedTuple):
     G_f: Array
 
     def repeated(self, times: int) -> _Step:
-        """Return the map of so many steps."""
+        """Return the map of several steps."""
         total, by_u, by_f = np.eye(len(self.F)), np.zeros_like(self.G), np.zeros_like(self.G_f)
         for _ in range(times):
             total, by_u, by_f = (self.F @ total, self.F @ by_u + self.G, self.F @ by_f + self.G_f)
@@ -234,9 +234,9 @@ class SampledLoop:
     """One half of the loop at one pose, with one drivetrain, hand and timing.
 
     Attributes:
-        A: of plant and estimator, x' = A x + B (u, f).
+        A: matrix of plant and estimator, x' = A x + B (u, f).
         n_z: (n_p,), rise of the harness point along p.
-        feedback: of services and planner, before the half.
+        feedback: feedback of services and planner, before the projection to the half.
     """
 
     def __init__(
@@ -332,11 +332,11 @@ class SampledLoop:
         return out[:, :width], out[:, width:]
 
     def eigenvalues(self, gains: Gains = NOMINAL) -> NDArray[np.complex128]:
-        """Return the eigenvalues of one planner period; stable inside the unit circle."""
+        """Return the eigenvalues of one planner period; stable if inside the unit circle."""
         return np.asarray(np.linalg.eigvals(self.period_map(gains)[0]), complex)
 
     def growth(self, gains: Gains = NOMINAL, above_hz: float = 0.0) -> Growth:
-        """Return the growth of the loop's slowest decay; `above_hz`: ignore slower motions."""
+        """Return the growth of the slowest decay, ignoring motions slower than `above_hz`."""
         period = self._timing.planner_period
         values = self.eigenvalues(gains)
         if above_hz > 0.0:
@@ -346,9 +346,9 @@ class SampledLoop:
         return Growth(rate, abs(np.angle(worst)) / (2.0 * math.pi * period))
 
     def impedance_z(self, w: float) -> complex:
-        """Return force over velocity of the harness point, N s/m, when a hand moves it at w rad/s.
+        """Return force over velocity of the harness point, N s/m, for a hand that moves it at w.
 
-        Valid only for the half that holds z. The force acts along the world's z at the harness.
+        w is in rad/s. Valid only for the half with z. The force acts along the world's z.
         """
         Phi, Gamma = self.period_map()
         z = np.exp(1j * w * self._timing.planner_period)
@@ -399,11 +399,11 @@ def _laws(
     alpha = feedback.lead_easing
     integral = (feedback.integral @ V)[np.newaxis]
     if np.abs(integral).max() * feedback.integral_gain < MOVES_MIN:
-        integral = integral[:0]  # it would stay as it is: a motion that does not decay
+        integral = integral[:0]  # it would stay constant, like a motion that does not decay
     C_q, C_v = V.T @ feedback.C_q @ V, V.T @ feedback.C_v @ V
     ease_p = -alpha * (hand.k_z * easing[0] + hand.k_pitch * easing[1])
     ease_v = -alpha * (hand.b_z * easing[0] + hand.b_pitch * easing[1])
-    if feedback.lifts > 0.0:  # A' = (rest - A) / FOLLOW_S - lifts z, rest by the hand alone
+    if feedback.lifts > 0.0:  # A' = (rest - A) / FOLLOW_S - lifts z; only the hand changes rest
         rise = feedback.lifts * FOLLOW_S * (P.T @ np.eye(6)[2])
         ease_p = hand.k_z * easing[0] - np.outer(V.T @ stand.J_harness[2], rise)
         ease_v = hand.b_z * easing[0]

@@ -18,8 +18,8 @@ Damping and coupling are chosen with the dynamic certificate, one set for all no
 
 The variables are the six local dampings of a leg, and bandwidth and damping of tau_coupled, all on
 a ladder of ratios. The method is coordinate descent from a stable start. Each step evaluates the
-certificate at a few poses and drivetrains; the end evaluates all of them. A pose that fails there
-is added.
+certificate at a few poses and drivetrains; the final check covers all of them. A pose that fails
+the check is added to the few.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ else:
     cp = late("cvxpy")
 
 Progress = Callable[[int, int], None]
-"""Called with the number of nodes done and their total."""
+"""Called with the number of nodes that are done, and their total."""
 Report = Callable[[str], None]
-"""Called with text on the search for damping."""
+"""Called with text about the search for damping."""
 
 N_HEIGHTS: Final = 25
 DYNAMIC_HEIGHTS: Final = 13
@@ -74,14 +74,14 @@ STEP: Final = 1.25
 ROUNDS: Final = 3
 START: Final = Design((40.0, 30.0, 40.0, 8.0, 40.0, 6.0), CouplingGains(3.0, 2.125))
 LEAD_HZ: Final = 0.3
-"""Frequency at which the squat's effort is computed: between its 0.2 Hz and a quick person's."""
+"""Frequency of the computed effort: between the squat's 0.2 Hz and a quick person's."""
 LEAD_M_S: Final = 0.15
 """Speed of the hand in the reference squat, m/s."""
 NOMINAL_STIFFNESS: Final = 8000.0
 DECAY_WANTED: Final = 0.6
-"""1/s; sway that decays more slowly adds to the cost."""
+"""Slowest decay of sway that adds no cost, 1/s."""
 SWAY_WEIGHT: Final = 40.0
-"""N per 1/s of missing decay."""
+"""Cost of missing decay, N per 1/s."""
 
 
 def solve(
@@ -94,11 +94,11 @@ def solve(
 ) -> GainSchedule:
     """Return the schedule of a robot.
 
-    A given design is used, and with `check` checked against the dynamic certificate; without one
-    it is searched for.
+    A given design is used, and with `check` checked against the dynamic certificate. Without a
+    design the function searches for one.
 
     Raises:
-        RunError: at a pose no local gains meet the certificate; names the pose.
+        RunError: no local gains meet the certificate at a pose; names the pose.
     """
     poses = Poses(config)
     z_nodes = np.linspace(*poses.reach(), N_HEIGHTS)
@@ -157,7 +157,7 @@ def design_of(schedule: GainSchedule) -> Design:
 
 
 def smallest_margins(config: RobotConfig, schedule: GainSchedule) -> Margins:
-    """Return the smallest margins at the nodes and half way between them."""
+    """Return the smallest margins at the nodes and halfway between them."""
     poses, certificate, scheduled = Poses(config), Certificate(config), ScheduledGains(schedule)
     service = onboard = np.inf
     z_nodes, pitches = np.array(schedule.z), np.array(schedule.pitch)
@@ -202,12 +202,12 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
     where = f"COM height {z:.3f} m, pitch {pitch:.2f} rad"
     try:
         with warnings.catch_warnings():
-            # the certificate judges an inaccurate solution, not the solver's warning
+            # the certificate judges an inaccurate solution; the solver's warning is not needed
             warnings.simplefilter("ignore", UserWarning)
             problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as error:
         raise RunError(f"{where}: the solver failed: {error}") from None
-    if problem.status == cp.settings.USER_LIMIT:  # there are values, and they are no solution
+    if problem.status == cp.settings.USER_LIMIT:  # there are values, but not a solution
         raise RunError(
             f"{where}: the solver stopped at its iteration limit; "
             "check the values of [certificate] and [law] in the robot file"
@@ -263,7 +263,7 @@ def _choose_design(
         if verdict.stable:
             return found
         if any(node is verdict.condition.node for node in checked):
-            return START  # a drivetrain between the sampled ones fails; START is stable with all
+            return START  # a drivetrain that was not sampled fails; START is stable with all
         checked.append(verdict.condition.node)
 
 
@@ -282,12 +282,12 @@ def check_design(
     verdict = DynamicCertificate(config, nodes).worst(design)
     if not verdict.stable:
         raise RunError(
-            f"the given damping is not stable: {verdict.words()}; run `xrl gains` without it"
+            f"the given damping is not stable: {verdict.words()}; run `xrl gains` without a damping"
         )
 
 
 def _descend(reduced: DynamicCertificate, design: Design, report: Report) -> Design:
-    """Return the cheapest design found by descent from a stable one."""
+    """Return the cheapest design that a descent from a stable one finds."""
     cost = _cost(reduced, design)
     for round_index in range(ROUNDS):
         before = cost

@@ -1,6 +1,6 @@
-"""Breaks one planner tick down: gains, margins, and each joint's torque by origin. Pure.
+"""Breaks down one planner tick into gains, margins, and each joint's torque by origin. Pure.
 
-`LawAtReference` is the function that the planner's tick runs. Here it runs on what the log holds:
+`LawAtReference` is the function that the planner's tick runs. Here its inputs come from the log:
 the joints, the references and the assist (docs/law.md).
 """
 
@@ -24,8 +24,8 @@ from shared.joints import N_LEG, SIDES
 from tools.lab.design.push_limit import LoadedStand, PushLimits, limits_at
 
 SINGULAR: Final = 1e-3
-"""Smallest singular value of a leg's Jacobian, m and rad mixed, with which there are gains: a knee
-bent by half a degree."""
+"""Minimum singular value of a leg's Jacobian, m and rad mixed, for which gains exist: a knee bent
+by half a degree."""
 
 
 class TorqueBreakdown(NamedTuple):
@@ -49,7 +49,7 @@ class TorqueBreakdown(NamedTuple):
     weakest_onboard: Weakest
     """Weakest direction with the drives alone."""
     pushes: dict[str, PushLimits]
-    """The hardest constant push along each direction, without assist."""
+    """The largest constant push along each direction, without assist."""
     gravity: Array
     assist: Array
     local_pd: Array
@@ -57,7 +57,7 @@ class TorqueBreakdown(NamedTuple):
     """Torque that the planner adds, before its low-pass."""
     filtered: Array
     """Change of the coupled torque by its low-pass, plus the integral F_I and the easing of the
-    operator's lead. Not computed here, because no tick in the log holds their states."""
+    operator's lead. Not computed here, because the log does not contain their states."""
 
     @property
     def total(self) -> Array:
@@ -98,8 +98,8 @@ def torque_breakdown(
     _require_bent(at_ref)
     if not np.isfinite(reference.J).all():
         raise RunError(
-            "singular pose: the two legs turn the torso opposite ways, and nothing lies between; "
-            "angles of legs that agree are right"
+            "singular pose: the two legs turn the torso in opposite directions, so its orientation "
+            "is undefined; the angles of both legs must agree"
         )
     hessian_weight = at_ref.hessian_times(F_O, np.zeros(3)).copy()
     e_p, e_pdot = reference.p - measured.p, reference.J @ v_ref - measured.pdot
@@ -132,6 +132,6 @@ def _require_bent(kinematics: Kinematics) -> None:
         if not smallest >= SINGULAR:
             raise RunError(
                 f"singular pose: the {side} leg is straight, or its hip or ankle is turned by 90 "
-                f"degrees; its Jacobian's smallest singular value is {smallest:.1g}, at least "
-                f"{SINGULAR:g} is right: bend the knee"
+                f"degrees; its Jacobian's smallest singular value is {smallest:.1g}, but must be "
+                f"at least {SINGULAR:g}: bend the knee"
             )

@@ -1,1 +1,1 @@
-"""Studies: many cases, run one after the other or side by side, each judged and counted."""
+"""Studies: many cases, run in sequence or in parallel, each judged and counted."""

@@ -1,4 +1,4 @@
-"""What would have come of a recorded run, had something died at one of its moments."""
+"""Counterfactuals of a recorded run: the outcome if something had died at one of its moments."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ R = TypeVar("R")
 T = TypeVar("T")
 
 EARLY_S: Final = 0.5 / topics.SIM_STATE.rate_hz
-"""A state so long before a moment is the nearest one."""
+"""A state this long before a moment still counts as the nearest one, s."""
 NEAR_NS: Final = 12 * NS_PER_MS
-"""A service whose last cycle lies further before a moment counts as dead in it."""
+"""A service whose last cycle is older than this at a moment counts as dead."""
 KILL_AFTER_S: Final = 1e-3
 STOOD, FELL = "#2e7d32", "#c0392b"
 
 
 class Moment(msgspec.Struct):
-    """All that a fleet is at one time of a run."""
+    """The complete state of a fleet at one time of a run."""
 
     state: SimState
     modules: dict[str, DriveManagerState] = msgspec.field(default_factory=dict)
-    """What each joint service that was alive knew."""
+    """State of each joint service that was alive."""
     planner: tuple[int, PlannerState] | None = None
     """Session and state of the planner, if it was alive."""
     margin: float | None = None
@@ -68,13 +68,13 @@ class Moment(msgspec.Struct):
 
 
 def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
-    """Return the moments of a run's scenario, so far apart.
+    """Return the moments of a run's scenario, at a given interval.
 
-    Joint services and planner are executed again from the log up to each moment, and so are
-    where they were to the last bit.
+    Joint services and planner are executed again from the log up to each moment, so their states
+    are exact to the last bit.
 
     Raises:
-        RunError: the run holds no states of the simulated world.
+        RunError: the run contains no states of the simulated world.
     """
     states: list[SimState] = log.messages(topics.SIM_STATE)
     found = []
@@ -85,8 +85,8 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
             due_s = every_s * (1 + math.floor((state.scenario_s + EARLY_S) / every_s))
     if not found:
         raise RunError(
-            f"{log.path}: no state of the simulated world in it (sim/state); a run of this version "
-            "whose scenario has begun has one every 0.1 s, a real robot's has none"
+            f"{log.path}: no state of the simulated world (sim/state) in it; a run of this version "
+            "whose scenario has started has one every 0.1 s, but a real robot's run lacks them"
         )
     for name in MODULES:
         joint = JointExecution(robot, name, ReexecutionResult(name, 0.0, exact=False))
@@ -108,9 +108,9 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
 def _at(
     moments: Sequence[Moment], rows: Iterable[tuple[int, R]], kept: Callable[[R], T]
 ) -> Iterator[tuple[Moment, T]]:
-    """Yield moments with what `kept` takes of the last row before each, if it is near.
+    """Yield each moment with the result of `kept` for the last row before it, if that is near.
 
-    Rows come with their times, in order; a row is valid only until the next one.
+    Rows come in order with their times; a row is valid only until the next row.
     """
     index = 0
     last: list[T] = []
@@ -128,7 +128,7 @@ def _at(
 
 
 class Task(msgspec.Struct, frozen=True):
-    """Task of a worker."""
+    """Input of a worker process."""
 
     robot: RobotConfig
     scenario: Scenario
@@ -138,28 +138,28 @@ class Task(msgspec.Struct, frozen=True):
     for_s: float
     """Duration of the continued run, s."""
     hand: tuple[HandRow, ...] = ()
-    """How somebody led the hand in the run."""
+    """Recorded motion of a hand that a person led, if any."""
 
 
 class Counterfactual(msgspec.Struct, frozen=True):
-    """What would have come of it."""
+    """Outcome of a counterfactual."""
 
     at_s: float
     """Scenario time of the kill."""
     stood: bool
     fell_after_s: float | None
     com_x_max_mm: float
-    """Largest distance from between the ankles, standing."""
+    """Largest distance from midway between the ankles while standing, mm."""
     com_y_max_mm: float
     sole_tilt_max_rad: float
     margin: float | None
-    """Margin of the failsafe certificate at the kill; None: none was published."""
+    """Margin of the failsafe certificate at the kill; None if none was published."""
 
 
 def scenario_from(scenario: Scenario, at_s: float, kill: tuple[str, ...], for_s: float) -> Scenario:
-    """Return the scenario from a time on: its pushes and faults from then, and these kills.
+    """Return the scenario from a time on: its later pushes and faults, and these kills.
 
-    A lasting fault that began before goes on from the first instant for the rest of its time.
+    A lasting fault that began earlier continues at once for its remaining time.
     """
     lasting = (
         msgspec.structs.replace(fault, at=at_s, duration=fault.at + fault.lasts_s - at_s)
@@ -177,7 +177,7 @@ def scenario_from(scenario: Scenario, at_s: float, kill: tuple[str, ...], for_s:
 
 
 def counterfactual_of(task: Task) -> Counterfactual:
-    """Go on from the moment, and judge."""
+    """Continue from the moment, and judge the outcome."""
     moment = task.moment
     scenario = scenario_from(task.scenario, moment.at_s, task.kill, task.for_s)
     fleet = Lockstep(
@@ -200,7 +200,7 @@ def counterfactual_of(task: Task) -> Counterfactual:
 def draw(
     log: RunLog, counterfactuals: Sequence[Counterfactual], title: str, every_s: float, path: Path
 ) -> None:
-    """Draw the fates over the recorded height into a PNG file."""
+    """Draw the outcomes over the recorded height to a PNG file."""
     truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
     figure = new_figure(11, 7.0)
     height, ended, com, margin = figure.subplots(

@@ -1,1 +1,1 @@
-"""Executes a run's services again from its log, through the very same objects."""
+"""Re-execution of a run's services from its log, with the very same objects."""

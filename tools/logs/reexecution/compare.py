@@ -1,6 +1,6 @@
-"""Recorded outputs against recomputed ones, bit for bit; and why they may differ.
+"""Bit-for-bit comparison of recorded and recomputed outputs, and reasons for differences.
 
-The likely reason is in what a run was made with, beside what executes it again.
+The likely reason is a difference between the run's environment and the present one.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _I64: Final = struct.Struct("<q")
 _SIGN: Final = 1 << 63
 _encode: Final = msgspec.json.Encoder().encode
 SHOWN: Final = 60
-"""Characters of a value."""
+"""Maximum number of characters shown of a value."""
 
 
 class _Difference(msgspec.Struct, frozen=True):
-    """One value that came out otherwise."""
+    """One recomputed value that differs."""
 
     t_ns: int
-    """When, by the service's clock."""
+    """Time on the service's clock."""
     tick: int
     """Its cycle, or its tick."""
     key: str
@@ -41,11 +41,11 @@ class _Difference(msgspec.Struct, frozen=True):
 
     @property
     def ulp(self) -> int | None:
-        """Distance in units in the last place; None where that means nothing."""
+        """Distance in units in the last place, or None if the values are not floats."""
         return ulp(self.recorded, self.recomputed)
 
     def describe(self) -> str:
-        """Return it in a line."""
+        """Return the difference in one line."""
         distance = f", {self.ulp} ULP apart" if self.ulp is not None else ""
         recorded, recomputed = (_short(value) for value in (self.recorded, self.recomputed))
         return (
@@ -58,10 +58,10 @@ class Comparison:
     """Compares messages, and keeps the first and the largest differences.
 
     Attributes:
-        compared: messages that were compared.
-        differing: of these, how many differ.
-        first: the first difference; None if there is none.
-        largest: the largest change of each number that changes, by key and field.
+        compared: number of compared messages.
+        differing: number of messages that differ.
+        first: the first difference, or None.
+        largest: the largest difference of each value that differs, by key and field.
     """
 
     def __init__(self, tolerance: float = 0.0) -> None:
@@ -90,7 +90,7 @@ class Comparison:
         return False
 
     def add(self, later: Comparison) -> None:
-        """Add what was compared in a later part of the run."""
+        """Add the comparison of a later part of the run."""
         self.compared += later.compared
         self.differing += later.differing
         self.first = self.first or later.first
@@ -104,16 +104,16 @@ class Comparison:
 
 
 class ReexecutionResult:
-    """Counts of one service, filled in as it is executed.
+    """Counts of one service, filled in during its execution.
 
     Attributes:
         service: its name.
-        exact: the memory is compared as well; not where a parameter was changed.
-        ticks: cycles or ticks that were executed.
-        skipped: that were not: before the first memory in the log, or after a loss.
-        starts: how often execution began from a recorded memory.
-        lost_inputs: messages that the service took and the log lacks.
-        comparison: of what came out.
+        exact: True if the snapshots are compared too; False where a parameter was changed.
+        ticks: number of executed cycles or ticks.
+        skipped: number of others: before the first snapshot in the log, or after a loss.
+        starts: number of starts from a recorded snapshot.
+        lost_inputs: messages that the service used and the log lacks.
+        comparison: comparison of the outputs.
     """
 
     def __init__(self, service: str, tolerance: float, *, exact: bool) -> None:
@@ -123,7 +123,7 @@ class ReexecutionResult:
         self.forget()
 
     def forget(self) -> None:
-        """Count from here on."""
+        """Reset the counts."""
         self.ticks = 0
         self.skipped = 0
         self.starts = 0
@@ -131,7 +131,7 @@ class ReexecutionResult:
         self.comparison = Comparison(self._tolerance)
 
     def add(self, later: ReexecutionResult) -> None:
-        """Add what came of the same service in a later part of the run."""
+        """Add the result of the same service in a later part of the run."""
         self.ticks += later.ticks
         self.skipped += later.skipped
         self.starts += later.starts
@@ -140,28 +140,28 @@ class ReexecutionResult:
 
     @property
     def differs(self) -> bool:
-        """True once something came out otherwise than recorded."""
+        """True if an output differs from the recorded one."""
         return self.comparison.first is not None
 
     @property
     def equal(self) -> bool:
-        """True if something was executed, and nothing came out otherwise."""
+        """True if something was executed and no output differs."""
         return self.ticks > 0 and not self.differs
 
 
 def memory_of(text: str, kind: type[State]) -> State:
-    """Return a recorded memory."""
+    """Return a recorded snapshot."""
     try:
         return msgspec.json.decode(text, type=kind)
     except (msgspec.DecodeError, RecursionError) as error:
         raise RunError(
-            f"a service's memory in the log is no {kind.__name__}: {error}; execute it again with "
-            "the checkout that wrote it (`xrl log info` tells its commit)"
+            f"a service's snapshot in the log is not a {kind.__name__}: {error}; execute it with "
+            "the checkout that wrote it (`xrl log info` shows its commit)"
         ) from None
 
 
 def size(row: _Difference) -> float:
-    """Return how far apart the two values are; infinite where they are no numbers."""
+    """Return the distance of the two values, infinite if they are not numbers."""
     a, b = row.recorded, row.recomputed
     return abs(b - a) if _is_number(a) and _is_number(b) else math.inf
 
@@ -172,14 +172,14 @@ def _short(value: Any) -> str:
 
 
 def ulp(a: Any, b: Any) -> int | None:
-    """Return the number of floats between a and b; None if one is no float."""
+    """Return the number of floats between a and b, or None if one is not a float."""
     if not (isinstance(a, float) and isinstance(b, float)):
         return None
     return abs(_ordered(a) - _ordered(b))
 
 
 def _ordered(value: float) -> int:
-    """Return a float's place in the order of all floats."""
+    """Return a float's position in the order of all floats."""
     bits = int(_I64.unpack(_F64.pack(value))[0])
     return bits if bits >= 0 else -(bits + _SIGN)
 
@@ -197,7 +197,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _walk(name: str, a: Any, b: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield every plain value of two messages of one type, with its name."""
+    """Yield every plain value of two messages of the same type, with its name."""
     if name == "snapshot" and isinstance(a, str) and isinstance(b, str) and a and b:
         a, b = msgspec.json.decode(a), msgspec.json.decode(b)
     if isinstance(a, dict) and isinstance(b, dict):
@@ -216,16 +216,16 @@ Origin: TypeAlias = Mapping[str, Mapping[str, str]]
 FACTS: Final = {
     "architecture": "architecture", "cpu_model": "CPU", "libc": "libc", "python": "Python",
 }  # fmt: skip
-"""Facts of `run` by which numbers may differ, with their names in a sentence."""
+"""Facts of `run` that may affect numbers, with their names in a sentence."""
 NUMERIC_PACKAGES: Final = ("casadi", "msgspec", "numpy", "pin")
 """Packages with which planner and joint services compute."""
 CHANGED: Final = " with changes"
-"""After a commit: the checkout has it and more, so two of them may differ."""
+"""Suffix of a commit with local changes; two checkouts with it may differ."""
 BLAS_VARIABLES: Final = ("OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE")
 
 
 def likely_reason(recorded: Origin, here: Origin) -> str:
-    """Return one line: what differs between a log's origin and this one, and what is not told."""
+    """Return one line with the differences of a log's origin from this one, and unknown facts."""
     differing, untold = [], []
     for (name, one), (_, other) in zip(_facts(recorded), _facts(here), strict=True):
         if UNKNOWN in (one, other) or (one == other and one.endswith(CHANGED)):
@@ -235,12 +235,12 @@ def likely_reason(recorded: Origin, here: Origin) -> str:
     if differing:
         line = f"likely reason, recorded with {'; '.join(differing)}"
     else:
-        line = "no reason known: it was recorded with the same as here"
-    return f"{line} (not told: {', '.join(untold)})" if untold else line
+        line = "no reason known: it was recorded with the same environment as here"
+    return f"{line} (unknown: {', '.join(untold)})" if untold else line
 
 
 def _facts(origin: Origin) -> Iterator[tuple[str, str]]:
-    """Yield the name and value of each fact; `UNKNOWN` where the origin does not tell it."""
+    """Yield the name and value of each fact; `UNKNOWN` if the origin lacks it."""
     run, versions = origin.get("run", {}), origin.get("packages", {})
     commit, changed = run.get("git_commit") or UNKNOWN, run.get("git_dirty") == "true"
     yield "code", commit if commit == UNKNOWN else commit[:12] + CHANGED * changed

@@ -1,8 +1,8 @@
-"""Executes services of a run again, in ranges of time that can be executed side by side.
+"""Re-execution of a run's services, in ranges of time that can be executed in parallel.
 
-Each range begins a little before its begin, at the memory that the services recorded there, and
-what comes before its begin is not counted. So every tick is executed once, from a memory that the
-range before it is held to.
+Execution of each range begins slightly early, at a recorded snapshot of the services. The part
+before the range is not counted. So every tick is executed once, from a snapshot that the previous
+range is compared with.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def execution_of(
     exact: bool = True,
     controller: Callable[[], Controller] | None = None,
 ) -> Execution:
-    """Return what executes a service with a robot; a planner perhaps with another controller."""
+    """Return an executor for a service with a robot, the planner's with an optional controller."""
     outcome = ReexecutionResult(name, tolerance, exact=exact)
     if name == "planner":
         return PlannerExecution(robot, outcome, controller)
@@ -40,13 +40,13 @@ def execution_of(
 
 
 RANGE_S: Final = 60.0
-"""Length of a range; shorter ones spend more on their lead-in and on starting."""
+"""Length of a range, s; shorter ranges spend more time on their lead-in and on starting."""
 LEAD_S: Final = 2.5
-"""Lead-in: memories are a second apart."""
+"""Lead-in, s: snapshots are a second apart."""
 
 
 class RangeTask(NamedTuple):
-    """One range of a run, and what executes it."""
+    """One range of a run, and how to execute it."""
 
     run: Path
     part: RunPart
@@ -55,20 +55,20 @@ class RangeTask(NamedTuple):
     params: tuple[str, ...] = ()
     """Changed keys of the robot file (`with_params`)."""
     controller: str = ""
-    """Somebody's own controller in the place of the law, as `--controller` takes it."""
+    """The user's own controller instead of the law, as for `--controller`."""
 
     @property
     def is_changed(self) -> bool:
-        """True if something else is executed than was recorded."""
+        """True if the execution differs from the recorded run."""
         return bool(self.params or self.controller)
 
 
 def ranges_of(
     index: RunIndex, whole: RangeTask, workers: int, range_s: float = RANGE_S
 ) -> list[RangeTask]:
-    """Return a task in ranges, in their order.
+    """Divide a task into ranges, in order.
 
-    What a parameter or a controller changes goes on from one range to the next: it stays one.
+    The effects of a changed parameter or controller carry over, so such a task is not divided.
     """
     if whole.is_changed:
         return [whole]
@@ -77,7 +77,7 @@ def ranges_of(
 
 
 def execute_range(task: RangeTask) -> list[ReexecutionResult]:
-    """Execute one range; return a result for each service, in the order of their names."""
+    """Execute one range; return a result for each service, in the order of the task."""
     index = _index_of(task.run)
     recorded = robot_of(RunLog(index, NOTHING, as_sent=True))
     robot = with_params(recorded, task.params, str(task.run)) if task.params else recorded
@@ -99,7 +99,7 @@ def execute_range(task: RangeTask) -> list[ReexecutionResult]:
 
 
 def merged(results: Sequence[list[ReexecutionResult]]) -> list[ReexecutionResult]:
-    """Return one result for each service, from those of the ranges in their order."""
+    """Return one result per service, from those of the ranges in order."""
     whole = results[0]
     for later in results[1:]:
         for mine, its in zip(whole, later, strict=True):

@@ -1,4 +1,4 @@
-"""Executes a joint service again, cycle by cycle: its own loop, over what the log has."""
+"""Re-execution of a joint service, cycle by cycle: its own loop, with inputs from the log."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _STATUS: Final = {int(status): status for status in DriveStatus}
 
 
 class _Cycle:
-    """What one cycle takes, and what came out: drive, ports, neighbours and clock of the loop."""
+    """Inputs and outputs of one cycle: drive, ports, neighbours and clock of the loop."""
 
     def __init__(self) -> None:
         self.trace: CycleTrace | None = None
@@ -65,7 +65,7 @@ class _Cycle:
         return True
 
     def write(self, _: object) -> None:
-        """Do nothing: the drive and the neighbours have what they got."""
+        """Do nothing, because the outputs to drive and neighbours are already recorded."""
 
     write_torque = set_position = write
 
@@ -94,16 +94,16 @@ class JointExecution:
     """One module's service, from its traces."""
 
     def __init__(self, robot: RobotConfig, name: str, outcome: ReexecutionResult) -> None:
-        """Take the robot to execute with, the module's name and what to fill in."""
+        """Use a robot and a module's name; fill in `outcome`."""
         self._robot, self._name, self.outcome = robot, name, outcome
         self._cycle = _Cycle()
         self._loop: JointLoop | None = None
         self._expected = 0
 
     def run(self, log: RunLog) -> Iterator[tuple[str, Message]]:
-        """Execute a run, or its next part: every cycle that can be.
+        """Execute a run, or its next part, in every cycle with complete inputs.
 
-        Yields what comes out, with its full key, where the log has its like.
+        Yields each output that the log also contains, with its full key.
         """
         self._load(log)
         traces: list[JointTrace] = log.messages(topics.JOINT_TRACE, self._name)
@@ -112,7 +112,7 @@ class JointExecution:
             if not log.begin_ns <= received_ns < log.end_ns:
                 continue
             if trace.seq != self._expected:
-                self._loop = None  # the log lacks traces in between, or the service restarted
+                self._loop = None  # the log lacks traces, or the service restarted
             self._expected = trace.seq + 1
             if trace.snapshot:
                 self._remember(trace)
@@ -124,7 +124,7 @@ class JointExecution:
                     yield from self._execute(self._loop, cycle)
 
     def _load(self, log: RunLog) -> None:
-        """Look up what the cycles of a part took and sent."""
+        """Look up the inputs and outputs of the cycles of a part."""
         name, self._log_robot = self._name, log.robot
         commands: list[JointCommand] = log.messages(topics.JOINT_COMMAND, name)
         self._commands = {(command.session, command.seq): command for command in commands}
@@ -133,11 +133,11 @@ class JointExecution:
         self._events = {event.t_ns: event for event in log.messages(topics.JOINT_EVENT, name)}
 
     def snapshot(self) -> DriveManagerState | None:
-        """Return the service's present state; None while it cannot be executed."""
+        """Return the service's present state, or None if it cannot be executed."""
         return None if self._loop is None else copied(self._loop.module.state)
 
     def _remember(self, trace: JointTrace) -> None:
-        """Go on from a recorded memory, or hold ours to it."""
+        """Start from a recorded snapshot, or compare the present state with it."""
         if self._loop is None:
             module = DriveManager(self._robot, self._name)
             module.state = memory_of(trace.snapshot, DriveManagerState)
@@ -163,7 +163,7 @@ class JointExecution:
         return JointLoop(self._robot, module, cycle, ports, neighbours=cycle, clock=cycle.clock)
 
     def _receive(self, trace: CycleTrace) -> bool:
-        """Set what a cycle takes; False if the log lacks its command."""
+        """Set the inputs of a cycle; return False if the log lacks its command."""
         cycle = self._cycle
         cycle.trace, cycle.command = trace, None
         cycle.refused += trace.malformed
@@ -208,14 +208,14 @@ def _reading(c: CycleTrace) -> DriveReading | None:
     """Return the drive's sample of a cycle.
 
     Raises:
-        RunError: it has a status that there is not.
+        RunError: its status is not valid.
     """
     if c.sampled_ns < 0:
         return None
     status = _STATUS.get(c.status)
     if status is None:
         raise RunError(
-            f"trace of the cycle at {c.now_ns} ns: drive status {c.status}; there are 0 to "
+            f"trace of the cycle at {c.now_ns} ns: drive status {c.status}, but the maximum is "
             f"{max(_STATUS)}: the record is damaged"
         )
     return DriveReading(

@@ -1,4 +1,4 @@
-"""`--param NAME=VALUE`: the recorded robot with another value."""
+"""`--param NAME=VALUE`: the recorded robot with changed values."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 def with_params(robot: RobotConfig, texts: Sequence[str], file: str) -> RobotConfig:
     """Return a robot with keys of its file changed.
 
-    A text is NAME=VALUE: NAME is a dotted key as in the robot file, with an index or a direction
-    for one value of a row: law.K_p.x=2000, joint_service.blend_ms=100. The gain schedule stays as
-    it was recorded, and counts as made for the changed robot.
+    A text is NAME=VALUE. NAME is a dotted key as in the robot file, with an index or a direction
+    for one value of a row: law.K_p.x=2000, joint_service.blend_ms=100. The gain schedule remains
+    as recorded, and is treated as made for the changed robot.
     """
-    table = msgspec.json.decode(msgspec.json.encode(robot))  # with lists, which can be changed
+    table = msgspec.json.decode(msgspec.json.encode(robot))  # with lists, which are mutable
     del table["gain_schedule"]
     for text in texts:
         name, _, value = text.partition("=")
@@ -40,7 +40,7 @@ def with_params(robot: RobotConfig, texts: Sequence[str], file: str) -> RobotCon
             is_text = isinstance(node[key], str)
             node[key] = value.strip() if is_text else tomllib.loads(f"value = {value}")["value"]
         except (LookupError, TypeError, ValueError):
-            right = "NAME=VALUE; a dotted key of the robot file, with x to yaw or an index in a row"
+            right = "NAME=VALUE: a dotted key of the robot file, with x to yaw or an index in a row"
             raise ConfigError(file, f"--param {text}", "no such key, or no value", right) from None
     changed = config_file.parse(tomli_w.dumps(table), f"{file}, with --param")
     schedule = robot.gain_schedule

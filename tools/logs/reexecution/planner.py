@@ -1,4 +1,4 @@
-"""Executes the planner again, tick by tick: its own loop, over what the log has."""
+"""Re-execution of the planner, tick by tick: its own loop, with inputs from the log."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _encode: Final = msgspec.json.Encoder().encode
 
 
 class _BySeq(Generic[M]):
-    """Finds a sender's message by its number; a restarted sender counts from the start again."""
+    """Finds a sender's message by its number; a restarted sender restarts its count."""
 
     def __init__(self, messages: Iterable[M]) -> None:
         self._rows: dict[int, list[M]] = {}
@@ -34,7 +34,7 @@ class _BySeq(Generic[M]):
             self._rows.setdefault(message.seq, []).append(message)
 
     def at(self, seq: int, by_ns: int) -> M | None:
-        """Return the newest message of this number that was made by a time; None if none was."""
+        """Return the newest message with this number up to a time, or None."""
         rows = self._rows.get(seq)
         if not rows:
             return None
@@ -42,7 +42,7 @@ class _BySeq(Generic[M]):
 
 
 class _LoggedInbox(Generic[M]):
-    """An inbox that holds what the log says was taken at this tick."""
+    """An inbox with the message that was used in this tick, from the log."""
 
     def __init__(self) -> None:
         self.message: M | None = None
@@ -53,7 +53,7 @@ class _LoggedInbox(Generic[M]):
 
 
 class _KeptOutbox(Generic[M]):
-    """An outbox that keeps what came out of this tick."""
+    """An outbox that keeps the outputs of this tick."""
 
     def __init__(self) -> None:
         self.messages: list[M] = []
@@ -64,7 +64,7 @@ class _KeptOutbox(Generic[M]):
 
 
 class _Tick:
-    """What one tick takes and sends."""
+    """Inputs and outputs of one tick."""
 
     def __init__(self) -> None:
         self.t_ns = 0
@@ -74,7 +74,7 @@ class _Tick:
         self.commands = _KeptOutbox[JointCommand]()
         self.status = _KeptOutbox[PlannerStatus]()
         self.ports = PlannerPorts(
-            states=(),  # each is received with the time at which it arrived
+            states=(),  # `_receive` passes each with its arrival time
             wrench=self.wrench,
             attitude=self.attitude,
             request=lambda _now_ns: self.request,
@@ -85,7 +85,7 @@ class _Tick:
 
 
 class PlannerExecution:
-    """The planner, re-executed from its statuses: each lists the inputs of its tick."""
+    """The re-executed planner; each recorded status lists the inputs of its tick."""
 
     def __init__(
         self,
@@ -93,14 +93,14 @@ class PlannerExecution:
         outcome: ReexecutionResult,
         controller: Callable[[], Controller] | None = None,
     ) -> None:
-        """Take the robot to execute with, what to fill in, and somebody's own controller."""
+        """Use a robot and, if given, the user's own controller; fill in `outcome`."""
         self._robot, self.outcome, self._controller = robot, outcome, controller
         self._tick = _Tick()
         self._loop: PlannerLoop | None = None
         self._last: PlannerStatus | None = None
 
     def run(self, log: RunLog) -> Iterator[tuple[str, Message]]:
-        """Execute a run, or its next part: every tick that can be; yield what comes out, by key."""
+        """Execute a run, or its next part, in ticks with complete inputs; yield outputs by key."""
         self._load(log)
         statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
         received = log.received_ns(topics.PLANNER_STATUS)
@@ -118,7 +118,7 @@ class PlannerExecution:
             yield from self._execute(self._loop, status)
 
     def _load(self, log: RunLog) -> None:
-        """Look up what the ticks of a part took and sent."""
+        """Look up the inputs and outputs of the ticks of a part."""
         self._log_robot = log.robot
         snapshots: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
         self._snapshots = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in snapshots}
@@ -132,13 +132,13 @@ class PlannerExecution:
         }
 
     def snapshot(self) -> tuple[int, PlannerState] | None:
-        """Return the planner's session and present state; None while it cannot be executed."""
+        """Return the planner's session and present state, or None if it cannot be executed."""
         if self._loop is None:
             return None
         return self._loop.planner.session, copied(self._loop.planner.state)
 
     def _begin(self, status: PlannerStatus) -> None:
-        """Go on from the memory after this tick, if the log has it."""
+        """Start from the snapshot after this tick, if the log contains one."""
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is None:
             return
@@ -156,7 +156,7 @@ class PlannerExecution:
         self.outcome.starts += 1
 
     def _receive(self, planner: Planner, status: PlannerStatus) -> bool:
-        """Give the planner what this tick took; False if the log lacks something of it."""
+        """Pass the planner the inputs of this tick; return False if the log lacks one."""
         tick, (state_seq, wrench_seq, attitude_seq) = self._tick, self._taken
         given = True
         for module, (seq, age_ns) in enumerate(
@@ -199,7 +199,7 @@ class PlannerExecution:
         (computed,) = tick.status.messages
         tick.commands.messages.clear()
         tick.status.messages.clear()
-        # tick_us is a time that was measured
+        # tick_us is a measured time
         computed = msgspec.structs.replace(computed, tick_us=status.tick_us)
         compare("planner/status", status.seq, status, computed)
         yield topics.PLANNER_STATUS.key(self._log_robot), computed
@@ -211,6 +211,6 @@ class PlannerExecution:
 
 
 def _follows(status: PlannerStatus, last: PlannerStatus) -> bool:
-    """Return True for the same planner's next tick; a new session is one more than the last."""
+    """Return True for the same planner's next tick; a new session is one above the last."""
     renewed = status.session == last.session + 1 and status.seq == last.seq + 1
     return renewed or (status.session == last.session and status.seq <= last.seq + 1)

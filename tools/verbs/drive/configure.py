@@ -1,4 +1,4 @@
-"""`xrl drive configure`: write the drives' settings, after a backup; calibrate what is not."""
+"""`xrl drive configure`: backs up and writes the drives' settings, and calibrates the drives."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from tools.terminal import Console, marked
 BACKUPS: Final = Path("out") / "drive-backups"
 
 EXAMPLES: Final = """
-xrl drive configure                          # shows what it would change, writes nothing
+xrl drive configure                          # show the differences, write nothing
 xrl drive configure --apply
 xrl drive configure --apply --module knee_left
 xrl drive configure --apply --calibrate --module knee_left     # a new board; its leg hangs
@@ -58,43 +58,43 @@ xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
 
 
 class ConfigureFlags(FleetRobotFlags):
-    """Which drives, what is written, and where the backup goes."""
+    """Drives to configure, settings to write, and folder of the backup."""
 
     dry_run: Annotated[
         bool,
         Arg(
             exclusive="what",
-            help="show the difference only, as without --apply; "
-            f"exit code {FAULT_EXIT_CODE} if there is one",
+            help="only show the differences, as without --apply; "
+            f"exit code {FAULT_EXIT_CODE} if there are any",
         ),
     ] = False
     apply: Annotated[bool, Arg(exclusive="what")] = False
-    """write and save it; the boards restart"""
+    """write and save the settings; the boards restart"""
     module: tuple[Module, ...] = ()
     """only this module; may be given several times (default: all six)"""
     restore: Annotated[Path | None, Arg(metavar="BACKUP.json")] = None
     """write a backup's settings instead of the robot file's"""
     out: Folder = BACKUPS
-    """where the backup is written"""
+    """folder for the backup"""
     calibrate: bool = False
-    """then calibrate the axes that are not, their leg hanging: each motor turns by about a turn and
-    back; the drive forgets its zero"""
+    """then calibrate the uncalibrated axes, whose leg must hang: each motor turns by about a turn
+    and back, and the drive loses its zero"""
     again: bool = False
-    """with --calibrate: those as well that are calibrated"""
+    """with --calibrate: also calibrate axes that are already calibrated"""
     yes: bool = False
-    """with --calibrate: do not ask"""
+    """with --calibrate: do not ask for confirmation"""
 
     def check(self) -> None:
-        """Refuse flags that mean nothing without a calibration, or with it."""
+        """Refuse flags that need --calibrate or contradict it."""
         super().check()
         if (self.again or self.yes) and not self.calibrate:
-            raise DriveError("--again and --yes go with --calibrate")
+            raise DriveError("--again and --yes need --calibrate")
         if self.calibrate and self.restore:
-            raise DriveError("--calibrate finds what no backup knows; leave --restore out")
+            raise DriveError("--calibrate measures what a backup cannot hold; remove --restore")
 
 
 def run(flags: ConfigureFlags) -> int:
-    """Show the differences, and write them if told to; return 0 if the drives are as wanted."""
+    """Show the differences and, with --apply, write them; return 0 if the drives are as wanted."""
     console = Console()
     path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
@@ -129,14 +129,14 @@ def _show(
     difference: Sequence[SettingChange],
     axes: Mapping[str, Sequence[str]],
 ) -> bool:
-    """Print what is to do; return False if it is nothing."""
+    """Print the pending changes; return False if there are none."""
     console.print(difference_table(difference) if difference else "nothing to change")
     for module, those in axes.items():
         console.print(f"to be calibrated: {module}, {' and '.join(those)}")
     if flags.calibrate and not axes:
-        console.print("every axis is calibrated; --again calibrates them once more")
+        console.print("every axis is calibrated; use --again to recalibrate")
     if (difference or axes) and not flags.apply:
-        console.print("\nnothing was written; `--apply` does it")
+        console.print("\nnothing was written; use `--apply` to write")
     return bool(difference or axes)
 
 
@@ -150,7 +150,7 @@ def _write(
     found: FoundBoards,
     interrupts: Interrupts,
 ) -> int:
-    """Keep a backup, write, read back, and calibrate; return the exit code."""
+    """Back up, write, read back and calibrate; return the exit code."""
     robot, path = file
     for module, board in boards.items():
         refuse_armed(module, board)
@@ -158,7 +158,7 @@ def _write(
         calibration.refuse_standing(robot, flags.run_dir, found, axes)
     kept = keep(flags.out, boards, path)
     restore = f"`xrl drive configure --restore {shlex.quote(str(kept))}`"
-    console.print(f"\nwhat the boards had: {kept}; {restore} shows it")
+    console.print(f"\nbackup of the boards: {kept}; {restore} shows it")
     with interrupts.kept():
         outcomes = apply(console, boards, difference, interrupts)
     code = _conclude(console, robot, outcomes) if difference else 0
@@ -176,38 +176,42 @@ def _write(
 
 
 def modules_of(flags: ConfigureFlags, robot: RobotConfig, saved: Backup | None) -> tuple[str, ...]:
-    """Return the named modules, or those of the backup, which must be of the same boards."""
+    """Return the given modules, by default those of the backup, or else all.
+
+    Raises:
+        DriveError: the backup lacks a module, or is from another board than the robot file's.
+    """
     if saved is None:
         return tuple(flags.module or MODULES)
     by_module = {board.module: board for board in saved.boards}
     modules = tuple(flags.module or by_module)
     for module in modules:
         if module not in by_module:
-            raise DriveError(f"{flags.restore}: it has no {module}; it has {', '.join(by_module)}")
+            raise DriveError(f"{flags.restore}: has no {module}, only {', '.join(by_module)}")
         serial = robot.module_named(module).serial_number.upper() if module in MODULES else ""
         other = by_module[module].serial_number.upper()
         if serial != other:
             raise DriveError(
-                f"{flags.restore}: {module} is ODrive {other} there and {serial or 'unnamed'} in "
-                "the robot file; a backup can be restored only onto the board it came from"
+                f"{flags.restore}: {module} is ODrive {other}, but {serial or 'unnamed'} in the "
+                "robot file; a backup can only be restored to the board it came from"
             )
     return modules
 
 
 def refuse_services(robot: RobotConfig, run_dir: Path, modules: Sequence[str]) -> None:
-    """Refuse to write where a joint service has one of the drives."""
+    """Raise FleetError if a joint service holds one of the drives."""
     for service in joint_services_up(robot, run_dir):
         if service in modules:
             raise FleetError(
-                f"the joint service of {service} is up in {run_dir}: saving settings restarts the "
-                "board under it. Hang the robot; `xrl down` first"
+                f"the joint service of {service} is up in {run_dir}, and saving settings restarts "
+                "its board. Hang the robot and run `xrl down` first"
             )
     for module in modules:
         drive_access.refuse_service(robot, module, run_dir)
 
 
 def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) -> dict[str, Board]:
-    """Return the boards by module; every one must be there, with a firmware that is known here."""
+    """Return the boards by module; all must be connected and have a known firmware."""
     boards = {}
     for module in modules:
         serial = robot.module_named(module).serial_number.upper()
@@ -220,8 +224,8 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) ->
             )
         if not is_known(board.firmware):
             raise DriveError(
-                f"{module}: firmware {describe_firmware(board.firmware)}; these settings are those "
-                f"of {describe_firmware(FIRMWARE)}"
+                f"{module}: firmware {describe_firmware(board.firmware)} is not supported; the "
+                f"settings are for {describe_firmware(FIRMWARE)}. Flash that first"
             )
         boards[module] = board
     return boards
@@ -233,9 +237,9 @@ def differences(
     saved: Backup | None,
     axes: Mapping[str, Sequence[str]] | None = None,
 ) -> list[SettingChange]:
-    """Return everything to change, module by module, but the marks of axes to be calibrated.
+    """Return all settings to change, by module, except the marks of axes to be calibrated.
 
-    A backup must be of the same firmware: settings may mean something else in another.
+    A backup must be from the same firmware: settings may mean something else in another.
     """
     rows: list[SettingChange] = []
     kept = {board.module: board for board in saved.boards} if saved else {}
@@ -246,8 +250,9 @@ def differences(
         firmware = describe_firmware(board.firmware)
         if firmware != kept[module].firmware:
             raise DriveError(
-                f"{module}: the backup is of firmware {kept[module].firmware}, the board has "
-                f"{firmware}: settings may mean something else there"
+                f"{module}: the backup is from firmware {kept[module].firmware}, but the board has "
+                f"{firmware}, where settings may mean something else; it can only be restored to "
+                "the same firmware"
             )
         rows += against_backup(module, settings_of(kept[module]), board)
     marks = {
@@ -273,7 +278,7 @@ def apply(
     difference: Sequence[SettingChange],
     interrupts: Interrupts,
 ) -> list[ChangeResult]:
-    """Write, save and read back one board after the other; one that fails does not stop the others.
+    """Write, save and read back each board in turn; a failed board does not stop the others.
 
     A board is finished before an interrupt takes effect: otherwise half of its settings would be
     active and none saved.
@@ -293,7 +298,7 @@ def apply(
 
 
 def _conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeResult]) -> int:
-    """Say what came of it and return the exit code."""
+    """Print the results and return the exit code."""
     bad = [outcome for outcome in outcomes if not outcome.good]
     for change, now, _ in bad:
         what = change.inhibit or f"it is {describe_setting(now)} after the restart"
@@ -305,5 +310,5 @@ def _conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeRes
     if done and robot.drive.zero_mark_turns > 0.0:
         written = (outcome.change for outcome in outcomes if not outcome.change.inhibit)
         restarted = dict.fromkeys(change.module for change in written)
-        console.print(f"restarted and therefore unzeroed: {', '.join(restarted)}; `xrl drive zero`")
+        console.print(f"unzeroed by the restart: {', '.join(restarted)}; run `xrl drive zero`")
     return FAULT_EXIT_CODE if bad else 0

@@ -1,4 +1,4 @@
-"""`xrl drive identify`: measure a hanging joint's friction and its rotors' reflected inertia."""
+"""`xrl drive identify`: measures a hanging joint's friction and its rotors' reflected inertia."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ STYLES: Final = {"change": "bold yellow", "agrees": "green", "measured": "", "no
 
 
 class IdentifyFlags(MotionFlags):
-    """Which joints, and how hard they are moved."""
+    """Joints to measure, and the torque that moves them."""
 
     module: Annotated[tuple[str, ...], positional("MODULE", one_of="which")] = ()
-    """which; or --all"""
+    """modules to measure; or give --all"""
     all: Annotated[bool, Arg(one_of="which")] = False
-    """all six, one joint after the other"""
+    """all six modules, one joint after the other"""
     axis: Annotated[str | None, Arg(choices=AXES)] = None
-    """only this one (default: both)"""
+    """only this axis (default: both)"""
     torque: Annotated[float, Range(1e-3, FINITE_MAX, "N m")] = 15.0
-    """amplitude of the sine motions; a bent leg's static load is added"""
+    """torque amplitude of the sine motions; a bent leg's static load is added"""
 
     def check(self) -> None:
         """Refuse unknown modules."""
         super().check()
         unknown = [name for name in self.module if name not in MODULES]
         if unknown:
-            raise DriveError(f"{unknown[0][:40]}: one of {', '.join(MODULES)} is right")
+            raise DriveError(f"{unknown[0][:40]}: must be one of {', '.join(MODULES)}")
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -86,7 +86,7 @@ def run(flags: IdentifyFlags) -> int:
             except DriveError as error:
                 if not results:
                     raise
-                found = Stopped(str(error))  # report what is measured by now
+                found = Stopped(str(error))  # report the results so far
             if isinstance(found, Stopped):
                 stopped = found
                 break
@@ -122,7 +122,7 @@ def report(estimates: Sequence[Estimate], console: Console) -> None:
     if rotor.verdict == "change":
         console.print(
             f"write into the robot file, section [joint]: armature = {rotor.value:.{rotor.digits}f}"
-            "; then `xrl gains`, because the gain schedule depends on it"
+            "; then run `xrl gains`, because the gain schedule depends on it"
         )
     if rotor.verdict != "not shown":
         console.print("joint.armature is measured now: remove it from `assumed`", style="dim")
@@ -150,7 +150,7 @@ def _measure(
         return moved
     fit = fit_sines(moved.samples, moved.plan)
     if fit is None:
-        return Stopped(f"{name}: too few samples for a fit; see its bus (`xrl doctor`)")
+        return Stopped(f"{name}: too few samples for a fit; check its bus with `xrl doctor`")
     return JointResult(name, fit, hanging_joint(robot, moved.q, *joint).inertia)
 
 
@@ -159,7 +159,7 @@ def _described(joint: str, plan: SinePlan) -> str:
         f"{1e3 * t.amplitude:.0f} mrad at {t.frequency_hz:g} Hz" for t in plan.course.tones
     )
     phi, theta = plan.bias
-    led = f"; led by {phi:+.2f}, {theta:+.2f} rad first" if any(plan.bias) else ""
+    led = f"; moved by {phi:+.2f}, {theta:+.2f} rad first" if any(plan.bias) else ""
     return (
         f"{joint}: {tones}, {plan.duration_s:.0f} s, at most {plan.torque_limit:.0f} N m{led}; the "
         "leg's other modules hold"

@@ -1,4 +1,4 @@
-"""`xrl drive jog`: move one joint a little and back, on the bench, and judge it."""
+"""`xrl drive jog`: moves one joint a little and back, on the bench, and judges the response."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PERIOD_S: Final = 2.0
 CYCLES: Final = 2
 TORQUE_LIMIT: Final = 10.0
 EMULATED: Final = 40.0
-"""N m that bend a leg of the emulated robot, which hangs with its soles on the floor."""
+"""Torque that bends a leg of the emulated robot, which hangs with its soles on the floor, N m."""
 BY_MAX: Final = 0.5
 PERIOD_MIN_S: Final = 0.5
 CYCLES_MAX: Final = 100
@@ -46,18 +46,18 @@ xrl drive jog knee_left --torque-limit 30     # if its load needs more
 """
 
 TRAVEL_SHARE: Final = 0.25
-"""Fraction of the requested travel by which the travel may differ."""
+"""Maximum error of the travel, as a fraction of the requested travel."""
 LAG_MAX: Final = 0.02
-"""rad between reference and joint, beyond the deflection by its load at rest."""
+"""Maximum lag behind the reference, beyond the deflection by the load at rest, rad."""
 SIBLING_MAX: Final = 0.02
-"""rad that the other axis may move."""
+"""Maximum motion of the other axis, rad."""
 
 
 class JogFlags(MotionFlags):
-    """Which joint, and how it moves."""
+    """Joint to move, and its motion."""
 
     module: Annotated[str, positional("MODULE", choices=MODULES)]
-    """which module"""
+    """module to move"""
     axis: Annotated[str, Arg(choices=AXES)] = "theta"
     by: Annotated[float, Range(-BY_MAX, BY_MAX, "rad")] = BY
     """distance out and back; positive theta leans forward"""
@@ -65,13 +65,13 @@ class JogFlags(MotionFlags):
     """time of one motion out and back"""
     cycles: Annotated[int, Range(1, CYCLES_MAX, "")] = CYCLES
     torque_limit: Annotated[Number, Arg(metavar="NM")] = TORQUE_LIMIT
-    """limit of both axes together at the joint, set as the drive's own current limit"""
+    """torque limit of both axes together at the joint, set as the drive's own current limit"""
 
     def check(self) -> None:
-        """Refuse a motion that is none."""
+        """Refuse a motion of zero."""
         super().check()
         if self.by == 0.0:
-            raise DriveError(f"--by 0: up to {BY_MAX:g} rad either way, and not 0, is right")
+            raise DriveError(f"--by 0: must not be 0; give up to {BY_MAX:g} rad either way")
 
     @property
     def plan(self) -> JogPlan:
@@ -81,7 +81,7 @@ class JogFlags(MotionFlags):
 
 
 def run(flags: JogFlags) -> int:
-    """Look, ask, move, idle, judge."""
+    """Check the joint, ask, move it, idle the drive and judge the motion."""
     console = Console()
     plan = flags.plan
     path = drive_access.robot_file(flags)
@@ -96,14 +96,14 @@ def run(flags: JogFlags) -> int:
         console.print(
             f"{module} {flags.axis}: {by:+g} rad and back, {cycles} times in {period_s:g} s each, "
             f"with at most {plan.torque_limit:g} N m "
-            f"({limited.drive.current_lim:.1f} A a motor, {limited.drive.vel_limit:.1f} turn/s)"
+            f"({limited.drive.current_lim:.1f} A per motor, {limited.drive.vel_limit:.1f} turn/s)"
         )
-        console.print(f"to see: {what_to_see(module, plan.axis, by)}")
+        console.print(f"you should see: {what_to_see(module, plan.axis, by)}")
         return plan
 
     with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
         if started:
-            console.print(f"its soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
+            console.print(f"the soles rest on the floor: a leg needs --torque-limit {EMULATED:g}")
         moved = ask_and_move(
             flags, robot, (module, plan.axis), introduce, interrupts, console, alone=True
         )
@@ -133,16 +133,16 @@ def report(moved: Moved[ThereAndBack], module: str, console: Console) -> int:
     console.print(marked(f"{words}: {{}} {{}}", module, AXES[plan.axis]))
     console.print(
         f"correct only if you saw this: {what_to_see(module, plan.axis, plan.course.by)}; "
-        "an encoder on the motor cannot tell"
+        "an encoder on the motor cannot show it"
     )
     return code
 
 
 class ThereAndBack(NamedTuple):
-    """by/2 (1 - cos) along the axis, some times."""
+    """Repeated motion by/2 (1 - cos) along the axis."""
 
     by: float
-    """rad, there and back."""
+    """Distance there and back, rad."""
     period_s: float
     """Period of one motion there and back, s."""
     cycles: int
@@ -159,7 +159,7 @@ class ThereAndBack(NamedTuple):
 
     @property
     def rate_max(self) -> float:
-        """Fastest rate that it asks for, rad/s."""
+        """Maximum requested rate, rad/s."""
         return math.pi * abs(self.by) / self.period_s
 
     def at(self, t_s: float) -> Pair:
@@ -180,12 +180,12 @@ class JogCheck(NamedTuple):
     what: str
     value: str
     wanted: str
-    """Remedy; "" if there is none."""
+    """Criterion; "" if the value is only shown."""
     good: bool
 
 
 def what_to_see(module: str, axis: int, by: float) -> str:
-    """Return a description of the right motion, for a person who watches.
+    """Return a description of the correct motion, for a person who watches.
 
     A positive angle leans the part above the joint forward (theta) or to the right (phi)
     against the part below; below a hanging torso, the lower part swings the same way.
@@ -199,11 +199,11 @@ def what_to_see(module: str, axis: int, by: float) -> str:
         way = "to its right" if positive else "to its left"
         foot = f"the sole turns its {'right' if positive else 'left'} edge up"
     lower = {"ankle": foot, "knee": f"the shin swings {way}", "hip": f"the thigh swings {way}"}
-    return f"the {upper} leans {way}; where the torso hangs, {lower[kind]}"
+    return f"the {upper} leans {way}; if the torso hangs, {lower[kind]}"
 
 
 def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
-    """Return the verdict on a jog that came to its end."""
+    """Return the verdict on a completed jog."""
     axis, other, by = plan.axis, 1 - plan.axis, plan.course.by
     rest = [s for s in samples if s.t_s < SETTLE_S][-20:]
     moving = [s for s in samples if SETTLE_S <= s.t_s <= plan.duration_s - SETTLE_S]
@@ -222,9 +222,9 @@ def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
     at_rest = f"{fmean([s.tau[axis] for s in rest]):+.2f} N m"
     stray_max = f"<= {SIBLING_MAX:g}"
     return [
-        JogCheck(f"{AXES[axis]} went", went, wanted, abs(travel - by) <= TRAVEL_SHARE * abs(by)),
+        JogCheck(f"{AXES[axis]} travel", went, wanted, abs(travel - by) <= TRAVEL_SHARE * abs(by)),
         JogCheck("largest lag", f"{lag:.4f} rad", f"<= {LAG_MAX:g}", lag <= LAG_MAX),
-        JogCheck(f"{AXES[other]} strayed", f"{strayed:.4f} rad", stray_max, strayed <= SIBLING_MAX),
+        JogCheck(f"{AXES[other]} moved", f"{strayed:.4f} rad", stray_max, strayed <= SIBLING_MAX),
         JogCheck("torque at rest", at_rest, "", True),
         JogCheck("largest torque, both axes", f"{peak:.2f} N m", f"< {plan.torque_limit:g}", True),
         JogCheck("friction, dry and viscous", f"{friction(moving, plan):.2f} N m", "", True),
@@ -234,7 +234,7 @@ def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
 def friction(moving: list[Sample], plan: JogPlan) -> float:
     """Return half the difference of torque between the way there and the way back, N m.
 
-    Only where the motion is fast; gravity and springs are the same on both ways and cancel.
+    Uses only the fast part of the motion; gravity and springs are equal on both ways and cancel.
     """
     omega = 2.0 * math.pi / plan.course.period_s
     sign = math.copysign(1.0, plan.course.by)

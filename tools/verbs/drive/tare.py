@@ -1,4 +1,4 @@
-"""`xrl drive tare`: a new zero for the harness sensor."""
+"""`xrl drive tare`: sets a new zero for the harness sensor."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console
 
 LOADED_N: Final = 30.0
-"""A harness that reads more is taken for one that is held; drift is less."""
+"""Above this reading the harness is assumed to be loaded, because drift is smaller, N."""
 REPEAT_S: Final = 0.02
-"""The bus may drop a message: the request is repeated until the tare has started."""
+"""Period of the request until the tare has started, s: the bus may drop a message."""
 HEARD_S: Final = 3.0
-"""Longest wait for the first wrench."""
+"""Timeout for the first wrench, s."""
 GIVE_UP_S: Final = 10.0
 
 EXAMPLES: Final = """
@@ -32,34 +32,34 @@ xrl drive tare --anyway
 
 
 class TareFlags(RunDirFlags):
-    """Whether it may be loaded."""
+    """Permission to tare a harness that reads a load."""
 
     anyway: Annotated[
         bool,
-        Arg(help=f"even if it reads more than {LOADED_N:g} N: the sensor has drifted so far"),
+        Arg(help=f"tare even if the harness reads more than {LOADED_N:g} N, if its sensor drifted"),
     ] = False
 
 
 def run(flags: TareFlags) -> int:
-    """Ask for it, and wait until the wrench is valid again."""
+    """Request the tare and wait until the wrench is valid again."""
     fleet = SupervisedFleet.attach(flags.run_dir)
     robot = fleet.manifest.robot()
     with open_session(robot, "tare", flags.run_dir) as session:
         requests = session.publisher(topics.HARNESS_TARE, TareRequest)
         wrenches = session.latest(topics.WRENCH, Wrench)
         before = tare(requests, wrenches, anyway=flags.anyway)
-    read = describe(before) if before.valid else "nothing valid"
-    Console().print(f"the harness is tared: its present reading is zero; before it read {read}")
+    read = describe(before) if before.valid else "no valid wrench"
+    Console().print(f"the harness is tared: its present reading is zero; the old one was {read}")
     return 0
 
 
 def tare(requests: Outbox[TareRequest], wrenches: Inbox[Wrench], *, anyway: bool) -> Wrench:
-    """Request the tare until it has started, wait until it is done; return the reading before."""
+    """Request the tare, wait until it is done, and return the reading before it."""
     before = newest = _first(wrenches)
     if before.valid and math.hypot(*before.force) > LOADED_N and not anyway:
         raise FleetError(
-            f"the harness reads {describe(before)}: release it and try again; or "
-            "use --anyway if nobody holds it and the sensor has drifted"
+            f"the harness reads {describe(before)}: unload it and try again; or use --anyway if "
+            "it is unloaded and its sensor has drifted"
         )
     source = f"xrl drive tare by {user_name()}"
     begun = False
@@ -74,11 +74,11 @@ def tare(requests: Outbox[TareRequest], wrenches: Inbox[Wrench], *, anyway: bool
         begun = begun or newest.tare != Tare.DONE
         if begun and newest.valid:
             return before
-    raise FleetError(f"no zero after {GIVE_UP_S:g} s: {_why_not(newest, begun=begun)}")
+    raise FleetError(f"not tared after {GIVE_UP_S:g} s: {_why_not(newest, begun=begun)}")
 
 
 def describe(wrench: Wrench) -> str:
-    """Return a wrench's size."""
+    """Return a wrench's magnitude as text."""
     return f"{math.hypot(*wrench.force):.1f} N, {math.hypot(*wrench.moment):.1f} N m"
 
 
@@ -89,7 +89,7 @@ def _first(wrenches: Inbox[Wrench]) -> Wrench:
         if wrench is not None:
             return wrench
         time.sleep(REPEAT_S)
-    raise FleetError("the harness service is silent; see `xrl status`")
+    raise FleetError("no wrench from the harness service; see `xrl status`")
 
 
 def _why_not(newest: Wrench, *, begun: bool) -> str:
@@ -98,5 +98,5 @@ def _why_not(newest: Wrench, *, begun: bool) -> str:
     if newest.saturated:
         return "a load cell is at the end of its range; unload the harness"
     if newest.tare == Tare.UNSTEADY:
-        return "the forces move; keep robot and harness still; it then continues by itself"
-    return "its load cells do not send steadily; check their bus"
+        return "the forces vary; keep robot and harness still, and the tare completes on its own"
+    return "the load cells do not send steadily; check their bus"

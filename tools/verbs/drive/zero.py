@@ -1,4 +1,4 @@
-"""`xrl drive zero`: tell drives where their joints are."""
+"""`xrl drive zero`: writes the joints' positions to their drives."""
 
 from __future__ import annotations
 
@@ -44,56 +44,58 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console, marked
 
 HEIGHT_TOLERANCE: Final = 1e-7
-"""m of torso height"""
+"""Tolerance of the torso's height, m."""
 ROUNDS: Final = 20
-"""Most rounds of the search for the COM height of a torso height; three are usual."""
+"""Maximum rounds of the search for the COM height of a torso height; three are usual."""
 DEGREES_FROM: Final = 7.0
-"""No joint has an angle of so many rad: more than a turn."""
+"""Angles above this, rad, are more than a turn and are assumed to be in degrees."""
 
 HEARD_S: Final = 2.0
-"""Longest wait for the states of joint services that are up."""
+"""Timeout for the states of joint services that are up, s."""
 
 EXAMPLES: Final = """
-xrl drive zero knee_left --at 0,-0.5          # by a protractor: phi, theta in rad
+xrl drive zero knee_left --at 0,-0.5          # measured with a protractor: phi, theta in rad
 xrl drive zero ankle_right --at -0.02,0.14
 xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
-xrl drive zero --all --resume                 # after a loss of power, hanging: what has not moved
+xrl drive zero --all --resume                 # hanging, after a loss of power: unmoved joints
 xrl drive zero --all --resume --untouched --swing --level     # knees and hips that have moved
-xrl drive zero ankle_left --resume --untouched --at 0.1,0.3   # roughly, to 0.08 rad
+xrl drive zero ankle_left --resume --untouched --at 0.1,0.3   # measured to 0.08 rad
 """
 
 _PAIR: Final = numbers(2, "phi and theta in rad, such as 0,-0.5")
 
 
 class ZeroFlags(FleetRobotFlags):
-    """Which modules, and where their joints are."""
+    """Modules to zero, and the angles of their joints."""
 
     module: Annotated[str | None, positional("MODULE", choices=MODULES, one_of="which")] = None
-    """one module"""
+    """module to zero"""
     all: Annotated[bool, Arg(one_of="which")] = False
-    """all six"""
+    """all six modules"""
     at: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where")] = None
-    """the joint is at these angles now, rad, as 0,-0.5"""
+    """present angles of the joint, rad, such as 0,-0.5"""
     standing: Annotated[Number | None, Arg(metavar="HEIGHT", exclusive="where")] = None
-    """the robot stands or hangs as if it stood: both soles flat and level, at their distance
-    (geometry.w_base), torso upright, COM over the ankles, the hips' axis HEIGHT m above the
-    ankles'; the angles then follow from the lengths in the robot file"""
+    """the robot stands, or hangs in the same pose: both soles flat and level, geometry.w_base
+    apart, torso upright, COM over the ankles, the hips' axis HEIGHT m above the ankles'; the angles
+    follow from the lengths in the robot file"""
     resume: bool = False
-    """after a loss of power, the robot hanging: find the whole turns by what was stored with the
-    zero, and say how clear that is; what is not clear is refused. --at and --standing are then
-    rough, within 0.08 rad"""
+    """after a loss of power, while the robot hangs: find the whole turns from the stored zero, and
+    report how clear the result is; unclear results are refused. With this flag, --at and --standing
+    may be rough, within 0.08 rad"""
     untouched: bool = False
-    """with --resume: you say that no encoder, magnet, motor or encoder cable was touched since the
-    zero; needed for joints that have moved"""
+    """with --resume: you confirm that no encoder, magnet, motor or encoder cable has been touched
+    since the zero; needed for joints that have moved"""
     swing: bool = False
     """with --resume: watch the legs swing, which shows that they hang free; for knees and hips that
     have moved"""
     level: bool = False
-    """with --resume, where no IMU is fitted: the torso is level to 2 degrees by a spirit level"""
+    """with --resume and without an IMU: you confirm that a spirit level shows the torso level to 2
+    degrees"""
     rest: bool = False
-    """change no zero; store where the joints rest now, for --resume (`xrl down` does it)"""
+    """change no zero; only store where the joints rest now, for --resume (`xrl down` also does
+    this)"""
     yes: bool = False
-    """do not ask"""
+    """do not ask for confirmation"""
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -101,21 +103,21 @@ class ZeroFlags(FleetRobotFlags):
         return MODULES if self.module is None else (self.module,)
 
     def check(self) -> None:
-        """Refuse one module's angles for all, and flags that do not fit each other."""
+        """Refuse one module's angles for all, and flags that contradict each other."""
         super().check()
         where = [self.at, self.standing]
         if self.rest and (self.resume or any(one is not None for one in where)):
-            raise DriveError("--rest changes no zero; give it alone")
+            raise DriveError("--rest changes no zero; remove --resume, --at and --standing")
         if not self.resume and (self.untouched or self.swing or self.level):
-            raise DriveError("--untouched, --swing and --level are for --resume")
+            raise DriveError("--untouched, --swing and --level need --resume")
         if not (self.resume or self.rest or any(one is not None for one in where)):
-            raise DriveError("give --at or --standing; after a loss of power --resume")
+            raise DriveError("give --at or --standing; after a loss of power, --resume")
         if self.all and self.at is not None:
-            raise DriveError("--at is for one module; for all give --standing HEIGHT")
+            raise DriveError("--at is for one module; with --all, give --standing HEIGHT")
 
 
 def run(flags: ZeroFlags) -> int:
-    """Look, ask, set, read back; keep the zero for a loss of power."""
+    """Check the drives, ask, write and read back; store the zero for a loss of power."""
     console = Console()
     path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
@@ -125,7 +127,7 @@ def run(flags: ZeroFlags) -> int:
     with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
         if flags.rest:
             kept = zero_record.store_rests(robot, path, flags.run_dir, modules, console.print)
-            console.print(f"{kept} of {len(modules)} modules rest, and that is stored")
+            console.print(f"{kept} of {len(modules)} modules rest; their positions are stored")
             return 0 if kept == len(modules) else FAULT_EXIT_CODE
         refuse_services(robot, holders)
         known = zero_record.identities(robot, flags.run_dir, modules, console.print)
@@ -141,20 +143,20 @@ def run(flags: ZeroFlags) -> int:
 
 
 class _Plan(NamedTuple):
-    """Where joints are to be zeroed."""
+    """Angles to write, and the question to ask first."""
 
     wanted: Mapping[str, Pair]
     """(phi, theta) by module, rad."""
     seen: Mapping[str, DriveLook]
-    """The drives when that was found."""
+    """State of the drives when the angles were determined."""
     table: Table
     question: str
     right: int = 0
-    """Modules that are zeroed already."""
+    """Number of modules that are already zeroed."""
 
 
 class _Zeroing(NamedTuple):
-    """Zeroing by measured angles, or by what was stored with the zero before."""
+    """Zeroing from measured angles, or from the stored zero."""
 
     robot: RobotConfig
     flags: ZeroFlags
@@ -166,7 +168,7 @@ class _Zeroing(NamedTuple):
     console: Console
 
     def measured(self, wanted: Mapping[str, Pair]) -> _Plan:
-        """Plan what a person has measured."""
+        """Plan from the angles that a person has measured."""
         table, seen = _table("before, rad", "after, rad", "change, rad"), self._look(wanted)
         for module, q in wanted.items():
             before = seen[module].q
@@ -177,12 +179,12 @@ class _Zeroing(NamedTuple):
         return _Plan(wanted, seen, table, "Are the joints at these angles now?")
 
     def resumed(self, about: Mapping[str, Pair]) -> _Plan:
-        """Find the whole turns again; say which modules are refused, and why."""
+        """Plan from the stored zeros; print which modules are refused, and why."""
         robot, flags, console = self.robot, self.flags, self.console
         if not any(module in self.record.modules for module in flags.modules):
             raise DriveError(
-                f"{', '.join(flags.modules)}: no zero is stored; zero by a protractor (--at, "
-                "--standing), as on the first day: from then on it can be resumed"
+                f"{', '.join(flags.modules)}: no zero is stored; zero with a protractor (--at, "
+                "--standing), as on the first day; after that, --resume works"
             )
         up = zero_record.upright(robot, flags.run_dir, level=flags.level)
         swings: dict[str, Swing] = {}
@@ -198,7 +200,7 @@ class _Zeroing(NamedTuple):
             untouched=flags.untouched, about=about, swings=swings,
         )  # fmt: skip
         found = decide(robot, evidence, up)
-        table = _table("found, rad", "by", "second best, rad away", "it takes, of what is allowed")
+        table = _table("found, rad", "by", "second best, rad away", "its error, of the allowed one")
         taken, zeroed = {}, []
         for module in flags.modules:
             decision = found.get(module)
@@ -210,14 +212,14 @@ class _Zeroing(NamedTuple):
                 table.add_row(module, _angles(q), decision.by, f"{decision.second:.2f}", times)
             else:
                 why = decision.why if decision is not None else faults[module]
-                why = why or "no zero of it is stored: zero it by --at"
+                why = why or "no zero is stored for it; zero it with --at"
                 console.print(marked("[yellow]{}: refused:[/] {}", module, why))
         if zeroed:
-            console.print(f"{', '.join(zeroed)}: zeroed already; left as they are")
-        return _Plan(taken, looks, table, "Does the robot hang so?", len(zeroed))
+            console.print(f"{', '.join(zeroed)}: already zeroed; left unchanged")
+        return _Plan(taken, looks, table, "Does the robot hang like this?", len(zeroed))
 
     def run(self, plan: _Plan) -> int:
-        """Ask, write, read back, and keep the zeros; return the exit code."""
+        """Ask, write, read back and store the zeros; return the exit code."""
         modules, console = self.flags.modules, self.console
         if not plan.wanted:
             console.print("nothing was changed")
@@ -238,7 +240,7 @@ class _Zeroing(NamedTuple):
         refuse_services(self.robot, self.holders)  # a person may take minutes to answer
         for module, seen in self._look(plan.wanted).items():
             if self.flags.resume and not zero_record.same_angles(seen, plan.seen[module], UNMOVED):
-                raise DriveError(f"{module}: it has moved meanwhile; nothing was changed; again")
+                raise DriveError(f"{module}: the joint has moved; nothing was changed; try again")
         done = self._set(plan.wanted)
         if self.flags.resume:
             done = [module for module in done if self._is_its_zero(module)]
@@ -250,7 +252,7 @@ class _Zeroing(NamedTuple):
         return 0 if len(done) + plan.right == len(modules) else FAULT_EXIT_CODE
 
     def _look(self, modules: Iterable[str]) -> dict[str, DriveLook]:
-        """Look at drives; refuse if one cannot be zeroed now, naming all that cannot."""
+        """Check drives; raise an error that names all drives that cannot be zeroed now."""
         seen = {module: look(self.drives[module], self.robot) for module in modules}
         faults = [f"{module}: {why}" for module, one in seen.items() if (why := refusal(one))]
         if faults:
@@ -258,12 +260,12 @@ class _Zeroing(NamedTuple):
         return seen
 
     def _set(self, wanted: Mapping[str, Pair]) -> list[str]:
-        """Set all, read all back, show it; return which read back right."""
+        """Write and read back all positions, and print them; return the modules read back right."""
         table, done = _table("written, rad", "read back, rad", ""), []
         for module, q in wanted.items():
             try:
                 back = zero(self.drives[module], q, self.robot)
-            except DriveError as error:  # one that fails does not stop the others
+            except DriveError as error:  # a failed module does not stop the others
                 self.console.print(marked("[bold red]{}[/]: {}", module, error))
                 back = None
             good = is_right(back, q)
@@ -279,7 +281,7 @@ class _Zeroing(NamedTuple):
         return done
 
     def _zeros(self, done: Iterable[str]) -> dict[str, ModuleZero]:
-        """Return the stored zeros with those of modules that were zeroed just now."""
+        """Return the stored zeros, updated with the modules that were just zeroed."""
         modules = dict(self.record.modules)
         for module in done:
             seen = look(self.drives[module], self.robot)
@@ -287,7 +289,7 @@ class _Zeroing(NamedTuple):
             modules.pop(module, None)
             why = zero_record.why_not_kept(self.robot, seen, identity)
             if why or angles is None:
-                words = "[yellow]{}: not kept over a loss of power: {}[/]"
+                words = "[yellow]{}: zero not stored for a loss of power: {}[/]"
                 self.console.print(marked(words, module, why))
                 continue
             zeroed = zero_record.zeroed(self.robot, module, seen.q_there, angles, identity)
@@ -295,21 +297,23 @@ class _Zeroing(NamedTuple):
         return modules
 
     def _is_its_zero(self, module: str) -> bool:
-        """Return True if a drive has its stored zero again, or else forgets the one it was given.
+        """Return True if a drive has its stored zero again; otherwise erase the zero just written.
 
-        A joint that creeps while it is written has another.
+        A joint that creeps during the write gets another zero.
         """
         drive, offsets = self.drives[module], self.record.modules[module].offsets
         seen = look(drive, self.robot)
         why = zero_record.not_its_zero(seen, offsets, self.robot.joint.gear_ratio)
         if why:
-            self.console.print(marked("[bold red]{}: it moved as it was written; again[/]", module))
+            self.console.print(
+                marked("[bold red]{}: it moved during the write; try again[/]", module)
+            )
             if seen.status is not DriveStatus.ARMED:
                 drive.set_position((0.0, 0.0))
         return not why
 
     def _keep(self, record: ZeroRecord) -> None:
-        """Write the zeros; that fails with a warning, because the drives have them."""
+        """Store the zeros; a failure is only a warning, because the drives have them."""
         try:
             zero_record.write_zeros(self.file, record)
         except DriveError as error:
@@ -325,7 +329,7 @@ def _angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[s
         stand = stand_angles(robot, flags.standing)
         console.print(
             f"a stand with the hips {flags.standing:g} m above the ankles and "
-            f"{abs(stand.hips_forward):.3f} m {'before' if stand.hips_forward > 0 else 'behind'} "
+            f"{abs(stand.hips_forward):.3f} m {'ahead of' if stand.hips_forward > 0 else 'behind'} "
             "them, torso upright, soles flat"
         )
         wanted = {module: stand.q[module] for module in flags.modules}
@@ -340,12 +344,12 @@ def _angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[s
 
 
 def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | None]) -> None:
-    """Refuse where a joint service has the drive's USB, or is not DISARMED."""
+    """Raise FleetError if a joint service holds the drive's USB or is not DISARMED."""
     up = {module: fleet for module, fleet in holders.items() if fleet is not None}
     for module, fleet in up.items():
         if robot.joint_service.driver == "odrive_usb":
             raise FleetError(
-                f"{module}: its joint service in {fleet.run.path} has the drive's USB; "
+                f"{module}: its joint service in {fleet.run.path} holds the drive's USB; run "
                 "`xrl down` first"
             )
     for fleet in {fleet.run.path: fleet for fleet in up.values()}.values():
@@ -355,25 +359,25 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | 
             state = states.get(module)
             if state is None:
                 raise FleetError(
-                    f"{module}: its joint service in {fleet.run.path} is up, but sends no state; "
-                    "see `xrl status`, or `xrl down` first"
+                    f"{module}: its joint service in {fleet.run.path} is up but sends no state; "
+                    "see `xrl status`, or run `xrl down` first"
                 )
             if state.mode in (Mode.HOLD, Mode.TRACK):
                 raise FleetError(
                     f"{module}: its joint service holds it ({Mode(state.mode).name}); hang the "
-                    "robot and `xrl down` first"
+                    "robot and run `xrl down` first"
                 )
             if state.mode != Mode.DISARMED:
                 raise FleetError(
                     f"{module}: its joint service is in {Mode(state.mode).name}; hang the robot "
-                    f"and `xrl kill {module}` (a restart leaves it), or `xrl down` first"
+                    f"and run `xrl kill {module}` (a restart leaves this mode) or `xrl down` first"
                 )
 
 
 def _states(
     robot: RobotConfig, fleet: SupervisedFleet, modules: list[str]
 ) -> dict[str, JointState]:
-    """Return one state of each module of a fleet that sends any."""
+    """Return one state of each of a fleet's modules that sends states."""
     states: dict[str, JointState] = {}
     with open_session(robot, "zero", fleet.run.path) as session:
         ends = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in modules}
@@ -412,8 +416,8 @@ def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
 
     longest = robot.geometry.l1 + robot.geometry.l2
     if not 0.0 < height < longest:
-        text = f"--standing {height:g}: the hips are between 0 and {longest:g} m above the ankles"
-        in_mm = f"; if these are mm: --standing {height / 1e3:g}" if height > 100.0 else ""
+        text = f"--standing {height:g}: must be between 0 and {longest:g} m (a straight leg)"
+        in_mm = f"; if this is in mm: --standing {height / 1e3:g}" if height > 100.0 else ""
         raise RunError(text + in_mm)
     limits = np.array(robot.joint_limits())
     kinematics = Kinematics(robot)
@@ -435,4 +439,4 @@ def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
             slope = (z_com - before[1]) / (z - before[0])
         before = (z, z_com)
         p_ref[2] += slope * (height - z)
-    raise RunError(f"--standing {height:g}: no stand found at this height")
+    raise RunError(f"--standing {height:g}: no stand found at this height; measure it again")

@@ -1,4 +1,4 @@
-"""`xrl log explain`: one tick of the law laid open, from a run's log."""
+"""`xrl log explain`: explains one tick of the law from a run's log."""
 
 from __future__ import annotations
 
@@ -38,26 +38,26 @@ from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
 from tools.terminal import Console, marked
 
 AWAY_S = 0.1
-"""s; a tick that much older than the requested time does not describe the robot then."""
+"""A tick older than this no longer describes the robot at the requested time, s."""
 LONG_S: Final = 60.0
-"""A longer run is read only within `AROUND_S` of the tick."""
+"""A longer run is read only within `AROUND_S` of the tick, s."""
 AROUND_S: Final = 5.0
 DIRECTIONS = ("x", "y", "z", "roll", "pitch", "yaw")
 SPLIT_DESCRIPTION = {
     SplitSource.DIAGONAL: "diag(K_q)",
     SplitSource.SCHEDULE: "certified schedule",
     SplitSource.STIFFENED: "stiffened: the wanted gains do not meet the certificate",
-    SplitSource.UNCERTIFIED: "none meets the certificate: hold",
+    SplitSource.UNCERTIFIED: "no gains meet the certificate: hold",
 }
 
 
 class Tick(NamedTuple):
-    """A tick as it stands in the log."""
+    """Tick as recorded in the log."""
 
     status: PlannerStatus
     commands: list[JointCommand]
     states: list[JointState]
-    """The states the tick was made from."""
+    """States that the tick used."""
 
 
 EXAMPLES: Final = """
@@ -66,7 +66,7 @@ xrl log explain out/a/run.mcap --at 2.5
 
 
 class ExplainFlags(Flags):
-    """Which tick of which run."""
+    """Run, and time of the tick."""
 
     log: Run
     at: Annotated[Number | None, Arg(metavar="T")] = None
@@ -74,7 +74,7 @@ class ExplainFlags(Flags):
 
 
 def run(flags: ExplainFlags) -> int:
-    """Print the account of one tick."""
+    """Print the explanation of one tick."""
     console = Console()
     index = RunIndex(flags.log)
     zero = zero_ns(index)
@@ -101,7 +101,7 @@ def run(flags: ExplainFlags) -> int:
 
 
 def _read_around(index: RunIndex, zero: int, at_s: float | None) -> RunLog:
-    """Read a run; of a long one what is around a time, or its end."""
+    """Read a run; if it is long, only the part around a time, by default its end."""
     if index.length_s <= LONG_S:
         return RunLog(index)
     at_s = (
@@ -124,7 +124,7 @@ def tick_at(log: RunLog, at_s: float | None, zero_ns: int) -> Tick:
         first, last = ((row.t_ns - zero_ns) / 1e9 for row in (led[0], led[-1]))
         if index < 0 or at_s > last + 1.0:
             raise RunError(
-                f"--at {at_s:g}: the planner ticks in this log from {first:.2f} to {last:.2f} s"
+                f"--at {at_s:g}: must be within the planner's ticks, {first:.2f} to {last:.2f} s"
             )
     status = led[index]
     commands, states = [], []
@@ -168,14 +168,14 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, consol
         )
     )
     words = _modules(tick.states)
-    console.print(f"modules, and how old their commands were: {words}", style="dim")
+    console.print(f"modules, and the age of their commands: {words}", style="dim")
     at_ns = status.t_ns if at_s is None else zero_ns + round(at_s * 1e9)
     late_s = (at_ns - status.t_ns) / 1e9
     if late_s > AWAY_S:
         words = _modules([log.newest(topics.JOINT_STATE, name).at(at_ns) for name in MODULES])
         console.print(
             marked(
-                "[yellow]at {:g} s the planner did not tick: its last, {:.2f} s before, "
+                "[yellow]the planner did not tick at {:g} s: its last tick, {:.2f} s earlier, "
                 "is shown. The modules at {:g} s: {}[/]",
                 at_s,
                 late_s,
@@ -188,26 +188,26 @@ def _introduce(log: RunLog, tick: Tick, at_s: float | None, zero_ns: int, consol
 
 
 def _modules(states: Sequence[JointState | None]) -> str:
-    """Return each module's mode, and how old the newest command was that it had."""
+    """Return each module's mode, and the age of its newest command."""
     found = []
     for module, state in zip(MODULES, states, strict=True):
-        words = "not heard yet"
+        words = "no state yet"
         if state is not None:
-            age = "none" if state.age_ns < 0 else f"{state.age_ns / NS_PER_MS:.1f} ms"
+            age = "no command" if state.age_ns < 0 else f"{state.age_ns / NS_PER_MS:.1f} ms"
             words = f"{name_of(Mode, state.mode)} {age}"
         found.append(f"{module} {words}")
     return ", ".join(found)
 
 
 def _network(log: RunLog, at_ns: int, zero_ns: int) -> str:
-    """Return the impairments in force at a monotonic time; empty for a run without any."""
+    """Return the impairments in force at a monotonic time; "" for a run without impairments."""
     done = impairments(log.messages(topics.LINK_EVENT))
     now = [f"{row.title}, {row.when(zero_ns)}" for row in done if row.at(at_ns)]
-    return "; ".join(now) or ("nothing is done to it here" if done else "")
+    return "; ".join(now) or ("not impaired here" if done else "")
 
 
 def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
-    """Print an account."""
+    """Print the explanation."""
     poses = _table("Body", DIRECTIONS)
     for row, values, digits in (
         ("p: m, rad", found.p, 4), ("p_ref: m, rad", found.p_ref, 4),
@@ -224,7 +224,7 @@ def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
     console.print(_gains(found))
     onboard = robot.joint_service.loop == "onboard"
     console.print(
-        "Each drive's own loop holds with D averaged over its module; the rest goes in as torque."
+        "Each drive's own loop holds with D averaged over its module; the rest is sent as torque."
         if onboard
         else "The drives get torques only.",
         style="dim",
@@ -241,7 +241,7 @@ def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:
 
 
 def describe(weakest: Weakest) -> Text:
-    """Return for example "0.24; weakest: lean forward, 71 N/m of 300"."""
+    """Return, for example, "0.24; weakest: lean forward, 71 N/m of 300"."""
     parts = ", ".join(
         f"{name} {value:.2f}"
         for name, value in zip(DIRECTIONS, weakest.p / np.abs(weakest.p).max(), strict=True)
@@ -261,7 +261,7 @@ def describe(weakest: Weakest) -> Text:
 
 
 def _describe_limits(limits: PushLimits) -> str:
-    """Return for example "led 72 N (left sole's toe), planner dead 56 N (...), ..."."""
+    """Return, for example, "led 72 N (left sole's toe), planner dead 56 N (...), ..."."""
     who = ("led", "planner dead", "drives alone", "soles and motors bear")
     return ", ".join(
         f"{name} {limit.force_n:.0f} N ({limit.part})"
@@ -302,5 +302,5 @@ def _table(title: str, columns: tuple[str, ...]) -> Table:
 
 
 def _numbers(values: Array, digits: int) -> list[str]:
-    """Return numbers with so many digits, none of them -0."""
+    """Return numbers with `digits` decimals; -0 is written as 0."""
     return [f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0]

@@ -1,4 +1,4 @@
-"""`xrl log export`: a run in other formats: a picture, CSV tables, a bag of ROS 2."""
+"""`xrl log export`: writes a run as an animation, CSV tables or a ROS 2 bag."""
 
 from __future__ import annotations
 
@@ -25,45 +25,45 @@ BAG_RATE_HZ: Final = 100.0
 EXAMPLES: Final = """
 xrl log export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
 xrl log export out/a/run.mcap --gif shove.gif --from 5 --to 9
-xrl log export out/a --csv tables                         # a file for each topic and module
+xrl log export out/a --csv tables                         # one file per topic and module
 xrl log export out/a --csv t --rate 100 --topic 'joint/*/state' --topic harness/wrench
 xrl log export out/a --ros2bag bag                        # ros2 bag play bag
 """
 
 
 class ExportFlags(PartFlags):
-    """Which run, and what is made of it."""
+    """Run to export, and the formats to write."""
 
-    file: Annotated[Path, positional("FILE", help=f"{RUN_HELP}; it is not touched")]
+    file: Annotated[Path, positional("FILE", help=f"{RUN_HELP}; it stays unchanged")]
     gif: Path | None = None
-    """draw the robot from the side and the front, as an animated picture"""
+    """write an animated GIF of the robot from the side and the front"""
     csv: Folder | None = None
-    """write CSV tables: a file for each key, with all of its messages"""
+    """write CSV tables: one file per topic and module, with all its messages"""
     topic: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
     """only these topics in the tables, such as 'joint/*/state'; may be repeated"""
     ros2bag: Folder | None = None
-    """write a bag of ROS 2 (MCAP): joint states, transforms, wrench, diagnostics"""
+    """write a ROS 2 bag (MCAP): joint states, transforms, wrench, diagnostics"""
     rate: Annotated[
         Rate | None,
         Arg(
-            help="rate of one table of all topics, with the newest messages at each time; "
-            f"or of the bag: default {BAG_RATE_HZ:g} Hz"
+            help="write one table of all topics at this rate, with the newest messages at each "
+            f"time; or rate of the bag (default: {BAG_RATE_HZ:g} Hz)"
         ),
     ] = None
     force: bool = False
-    """replace what exists"""
+    """replace existing files"""
 
     def check(self) -> None:
-        """Refuse nothing to write, and what goes with something that is not written."""
+        """Refuse a command without an output, and flags of outputs that are not written."""
         super().check()
         if not (self.gif or self.csv or self.ros2bag):
             raise RunError(
-                "say what to write: --gif FILE, --csv DIR, --ros2bag DIR, or several of them"
+                "no output is given; add --gif FILE, --csv DIR, --ros2bag DIR, or several of them"
             )
         if self.topic and self.csv is None:
-            raise RunError("--topic chooses what is in tables: add --csv DIR")
+            raise RunError("--topic selects the topics of tables; add --csv DIR")
         if self.rate is not None and self.csv is None and self.ros2bag is None:
-            raise RunError("--rate is that of tables or a bag: add --csv or --ros2bag")
+            raise RunError("--rate is for tables or a bag; add --csv DIR or --ros2bag DIR")
 
 
 def run(flags: ExportFlags) -> int:
@@ -109,7 +109,7 @@ def _write_tables(
 def _write_bag(
     index: RunIndex, part: RunPart, flags: ExportFlags, out: Path, console: Console
 ) -> None:
-    """Write a bag of ROS 2, with progress."""
+    """Write a ROS 2 bag, with progress."""
     require("ros2")
     from tools.export.ros2_bag import write_bag  # noqa: PLC0415 - needs the extra
 
@@ -124,7 +124,7 @@ def _write_bag(
 
 
 def _draw(log: RunLog, out: Path, console: Console) -> None:
-    """Draw the run's moving picture, with progress."""
+    """Write the run's animation, with progress."""
     require("plot")
     from tools.judge.reports.moving_picture import write_gif  # noqa: PLC0415 - needs the extra
 

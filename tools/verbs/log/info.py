@@ -35,9 +35,9 @@ SLOW: Final = 0.9
 """Fraction of a topic's nominal rate below which it is marked."""
 MIB: Final = 1 << 20
 LARGE: Final = 128 * MIB
-"""A larger finished file is not read through."""
+"""Larger finished files are not read completely, bytes."""
 INJECTED_MAX: Final = 12
-"""Impairments with a line of their own."""
+"""Maximum number of impairments listed."""
 
 
 EXAMPLES: Final = """
@@ -48,25 +48,25 @@ xrl log info out/a/run.mcap --json | jq '.topics | map_values(.sequence.missing)
 
 
 class InfoFlags(Flags):
-    """Which log, and in which form."""
+    """Log to inspect, and the output format."""
 
     file: Annotated[Path, positional("FILE")]
-    """an MCAP file, finished or not; or a directory: the first file of its run"""
+    """MCAP file, finished or not; or a directory, for the first file of its run"""
     whole_run: Annotated[bool, option("--run")] = False
-    """all files of the run that it belongs to, counted together"""
+    """count all files of the run together"""
     full: Annotated[
         bool,
         Arg(
-            help=f"read every message even of a finished file over {LARGE >> 20} MiB, for sizes, "
-            "longest gaps and damage; without it the recorder's counts are shown"
+            help=f"read every message, even of a finished file over {LARGE >> 20} MiB, for sizes, "
+            "longest gaps and damage; without this flag the recorder's counts are shown"
         ),
     ] = False
     json: bool = False
-    """print JSON"""
+    """print the survey as JSON"""
 
 
 def run(flags: InfoFlags) -> int:
-    """Print it; 0 if the file can be read."""
+    """Print the survey; return 0 if the file can be read."""
     survey = Survey()
     file = files_in(flags.file)[0] if flags.file.is_dir() else flags.file
     first = _add(survey, file, full=flags.full)
@@ -103,7 +103,7 @@ def show(survey: Survey, run_files: list[Path], console: Console) -> None:
         console.print()
         console.print(_table(present, f"xrl/{robot}/", events=survey.files[0].ours))
     if any(topic.longest_gap_ns is None for topic in present.values()):
-        console.print("as its recorder counted; --full reads every message", style="dim")
+        console.print("counts are the recorder's; --full reads every message", style="dim")
     silent = len(survey.topics) - len(present)
     if silent:
         console.print(f"{silent} more topics without a message", style="dim")
@@ -129,12 +129,12 @@ def _show_file(file: FileFacts, console: Console) -> None:
     flush_ms = file.metadata.get("recorder", {}).get("flush_ms", "")
     if not file.finished and not file.in_use:
         if flush_ms:
-            console.print(f"  written every {printable(flush_ms)} ms: all after that is missing")
+            console.print(f"  written every {printable(flush_ms)} ms: anything later is missing")
         command = f"xrl log recover {printable(shlex.quote(str(file.path)))}"
         console.print(f"  finish it with: {command}", soft_wrap=True)
     elif lines and not file.in_use:
         command = f"xrl log recover {printable(shlex.quote(str(file.path)))}"
-        console.print(f"  a copy of all that can be read: {command}", soft_wrap=True)
+        console.print(f"  to copy all that can be read: {command}", soft_wrap=True)
     note = file.metadata.get("recovered")
     if note is not None:
         console.print(f"  recovered from {printable(note.get('from', '?'))}", style="dim")
@@ -160,7 +160,7 @@ def _show_run(survey: Survey, console: Console) -> None:
     version = about.get("schema_version", "")
     if not file.ours:
         written = printable(f"profile {file.profile!r}, written by {file.library}")
-        grid.add_row("foreign", f"{written}: `xrl` reads no more of it than this")
+        grid.add_row("foreign", f"{written}: `xrl` can read nothing else in it")
     elif version != SCHEMA_VERSION:
         grid.add_row(
             "version", f"{printable(version) or 'unknown'}; this code writes {SCHEMA_VERSION}"
@@ -171,9 +171,9 @@ def _show_run(survey: Survey, console: Console) -> None:
 
 
 def _injected(survey: Survey) -> list[str]:
-    """Return a line for each impairment of the network, times as of the scenario if it began.
+    """Return a line for each impairment of the network, in scenario time if the scenario began.
 
-    Files without one are not read again.
+    Files without impairments are not read again.
     """
     robot = survey.files[0].metadata.get("run", {}).get("robot", "")
     topic = survey.topics.get(topics.LINK_EVENT.key(robot))
@@ -190,7 +190,7 @@ def _injected(survey: Survey) -> list[str]:
     except XrlError as error:
         return [str(error)]
     lines = [f"{row.title}: {row.when(zero)}; {row.counts()}" for row in impairments(events)]
-    since = " (s since the log begins)" if zero == indices[0].span_ns[0] else ""
+    since = " (s since the start of the log)" if zero == indices[0].span_ns[0] else ""
     more = len(lines) - INJECTED_MAX
     if more > 0:
         lines[INJECTED_MAX:] = [f"and {more} more"]

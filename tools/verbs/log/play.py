@@ -1,4 +1,4 @@
-"""`xrl log play`: put a log back onto a bus of its own, under `replay/` and never a live key."""
+"""`xrl log play`: replays a log on a separate bus, under `replay/` and never under a live key."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RATE_MIN: Final = 0.001
 RATE_MAX: Final = 1000.0
 SHOW_NS: Final = 200 * NS_PER_MS
 DROPPED_NS: Final = round(4.9 * NS_PER_S)
-"""A `put` that takes 5 s has dropped the link of a subscriber that takes nothing."""
+"""A `put` takes this long, ns, if it drops the link of a subscriber that reads nothing for 5 s."""
 _POLL_S: Final = 0.01
 _SETTLED_S: Final = 0.1
 _FLUSH_S: Final = 1.0
@@ -45,41 +45,41 @@ xrl log play out/a --from 10 --to 12.5 --topic 'joint/*/state'
 """
 
 ABOUT: Final = f"""
-Messages go out in the order and at the times at which the recorder had them, byte for byte: t_ns
-and every other stamp in them is that of the recording. Late messages go at once.
+Messages are sent byte for byte, in the order and at the intervals of the recording: t_ns and every
+other stamp in them are those of the recording. Late messages are sent at once.
 
-Key xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, to which no service subscribes. The player has a
-bus of its own and connects to no peer. Subscribers connect to the player at --listen:
+Key xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, to which no service subscribes. The player has
+its own bus and connects to no peer. Subscribers connect to the player at --listen:
   open_session(robot, "mine", run_dir, connect=["{LISTEN}"])
   .stream(["{PREFIX}/**"])
-or any Zenoh 1.x peer or client that connects there.
+Any other Zenoh 1.x peer or client can also connect there.
 
-Exit code: 0 played; 2 refused, messages could not be sent, or a subscriber that took nothing for
-5 s was dropped; 130 Ctrl-C. A subscriber that links later misses earlier messages: the summary
+Exit code: 0 played; 2 refused, messages could not be sent, or a subscriber that read nothing for
+5 s was dropped; 130 Ctrl-C. A subscriber that connects later misses earlier messages: the summary
 reports how many messages had no subscriber.
 """
 
 
 class PlayFlags(RunDirFlags, PartFlags):
-    """Which part of a log is played, and how fast."""
+    """Part of a log to replay, and its speed."""
 
     file: Run
     topic: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
-    """play only this: a name below xrl/<robot>/, or such as joint/*/state; may be repeated"""
+    """replay only this topic, named without xrl/<robot>/, such as joint/*/state; may be repeated"""
     rate: Annotated[float, Range(RATE_MIN, RATE_MAX, ""), option("--rate", "-r", metavar="R")] = 1.0
     """recorded seconds per second"""
     wait: Seconds = 1.0
-    """longest wait for the first subscriber"""
-    listen: Annotated[str, Arg(metavar="ENDPOINT", help=f"where to listen (default {LISTEN})")] = (
-        LISTEN
-    )
+    """maximum wait for the first subscriber"""
+    listen: Annotated[
+        str, Arg(metavar="ENDPOINT", help=f"endpoint to listen on (default: {LISTEN})")
+    ] = LISTEN
 
 
 class Entry(NamedTuple):
-    """A recorded message."""
+    """Recorded message."""
 
     after_ns: int
-    """Time since the start of the part that is played."""
+    """Time since the start of the replayed part, ns."""
     key: str
     payload: bytes
 
@@ -111,14 +111,14 @@ class Played(msgspec.Struct):
     failed: int = 0
     """Not sent: the session is closed."""
     unheard: int = 0
-    """Sent before anybody had subscribed."""
+    """Sent before there was a subscriber."""
     dropped: int = 0
-    """Links that were dropped because a subscriber took nothing for 5 s."""
+    """Links that were dropped because a subscriber read nothing for 5 s."""
     late_max_ns: int = 0
-    """Longest time after its moment that a message went out."""
+    """Maximum delay of a message behind its due time, ns."""
 
     def summary(self, keys: int, took_s: float) -> str:
-        """Return how it went, in one line."""
+        """Return the counts in one line."""
         late_ms = self.late_max_ns / NS_PER_MS
         sent = f"{self.failed} not sent: the session is closed" if self.failed else "all sent"
         line = (
@@ -126,11 +126,11 @@ class Played(msgspec.Struct):
             f"{sent}"
         )
         if self.dropped:
-            line += "; NOT ALL ARRIVED: a subscriber took nothing for 5 s and its link was dropped"
+            line += "; NOT ALL ARRIVED: a subscriber read nothing for 5 s and its link was dropped"
         if self.unheard == self.sent:
-            return f"{line}; nobody listened"
+            return f"{line}; there was no subscriber"
         if self.unheard:
-            line += f"; nobody listened to the first {self.unheard}: --wait S waits longer"
+            line += f"; no subscriber for the first {self.unheard}: give a longer --wait"
         return line
 
 
@@ -145,17 +145,17 @@ def pace(
     heard: Callable[[], bool],
     show: Callable[[int], None],
 ) -> None:
-    """Send each message when its time has come, and late ones at once, in order.
+    """Send each message at its due time, in order; late messages are sent at once.
 
     Args:
         entries: the messages.
         ports: the way to each of their keys.
         rate: recorded seconds per second.
-        played: counts, which grow.
+        played: counts to update.
         now_ns: monotonic clock.
         sleep: waits, s.
-        heard: True if somebody subscribes.
-        show: takes the position, ns, now and then.
+        heard: returns True if there is a subscriber.
+        show: receives the position from time to time, ns.
     """
     began_ns = show_ns = now_ns()
     is_heard = False
@@ -186,9 +186,9 @@ def run(flags: PlayFlags) -> int:
     if next(entries(index, part, keys), None) is None:
         raise RunError("none of these topics has a message in this part of the log")
     if not index.complete or index.damage:
-        words = f"{flags.file}: plays as far as it can be read; see `xrl log info`"
+        words = f"{flags.file}: incomplete; replayed as far as readable; see `xrl log info`"
         console.print(words, style="yellow", markup=False, soft_wrap=True)
-    # Endpoints are never taken from a log, which may be a stranger's: the player would dial them.
+    # Never take endpoints from a log, whose origin is unknown: the player would connect to them.
     robot = config_file.load_without_schedule(DEFAULT_CONFIG)
     with contextlib.ExitStack() as stack:
         stack.callback(_leave_no_directory, flags, made=not flags.run_dir.exists())
@@ -199,7 +199,7 @@ def run(flags: PlayFlags) -> int:
         length_s = min(part.end_s, index.length_s) - part.begin_s
         words = (
             f"{length_s:.2f} s of {index.robot}, {len(ports)} keys, onto {PREFIX}/**; "
-            f"subscribers dial {expand(flags.listen, flags.run_dir)}"
+            f"subscribers connect to {expand(flags.listen, flags.run_dir)}"
         )
         console.print(words, markup=False, soft_wrap=True)
         _await_subscriber(ports, flags.wait)
@@ -213,7 +213,7 @@ def _play(
     length_s: float,
     console: Console,
 ) -> int:
-    """Play, and say at the end how it went."""
+    """Replay, and print the counts at the end."""
     columns = (TextColumn("{task.completed:.2f} / {task.total:.2f} s"),)
     played, began_ns = Played(), now_ns()
     try:
@@ -234,7 +234,7 @@ def _play(
 
 
 def _await_subscriber(ports: Mapping[str, RawPublisher], wait_s: float) -> None:
-    """Wait for the first subscriber, and until its subscriptions are all there."""
+    """Wait for the first subscriber and all its subscriptions."""
     deadline, matched, since = time.monotonic() + wait_s, 0, time.monotonic()
     while time.monotonic() < deadline and not (matched and time.monotonic() > since + _SETTLED_S):
         before, matched = matched, sum(port.matched for port in ports.values())
@@ -243,7 +243,7 @@ def _await_subscriber(ports: Mapping[str, RawPublisher], wait_s: float) -> None:
 
 
 def _leave_no_directory(flags: PlayFlags, *, made: bool) -> None:
-    """Remove the run directory if it was made for this play's socket and nobody uses it."""
+    """Remove the run directory if it was created for this replay's socket and is unused."""
     if made:
         with contextlib.suppress(OSError):
             flags.run_dir.rmdir()

@@ -1,4 +1,4 @@
-"""`xrl log recover`: give a log that was never finished its end."""
+"""`xrl log recover`: writes a complete copy of a log that was not finished."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ xrl log recover out/a/run.mcap -o rescued.mcap
 
 
 class RecoverFlags(Flags):
-    """Which log, and where the copy goes."""
+    """Log to recover, and path of the copy."""
 
     file: Annotated[Path, positional("FILE")]
-    """an MCAP file; it stays unchanged"""
+    """MCAP file, which stays unchanged"""
     out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None
-    """where the recovered file goes (default: NAME.recovered.mcap beside it)"""
+    """path of the recovered file (default: NAME.recovered.mcap beside FILE)"""
     force: bool = False
     """replace OUT if it exists"""
 
 
 def run(flags: RecoverFlags) -> int:
-    """Recover it; 0 also if it lacks nothing."""
+    """Recover the log; return 0 even if nothing is missing."""
     console = Console()
     path = flags.file
     if flags.out is None and recover.is_whole(path):
@@ -43,7 +43,7 @@ def run(flags: RecoverFlags) -> int:
     out = flags.out or recovered_name(path)
     refuse_taken(out, path, force=flags.force)
     if in_use(path):
-        console.print("a recorder is writing this file: what follows is not in the copy")
+        console.print("a recorder is writing this file: later messages are not in the copy")
     outcome = recover.recover(path, out)
     console.print(marked("[bold]{}[/]: a finished file", out), soft_wrap=True)
     for line in recover.describe(outcome):
@@ -51,8 +51,8 @@ def run(flags: RecoverFlags) -> int:
     flush_ms = head_of(path).get("recorder", {}).get("flush_ms", "")
     if not outcome.finished and flush_ms:
         console.print(
-            f"  the recorder wrote every {printable(flush_ms)} ms: what came after its last write "
-            "is lost",
+            f"  the recorder wrote every {printable(flush_ms)} ms: messages after its last write "
+            "are lost",
             soft_wrap=True,
         )
     return 0

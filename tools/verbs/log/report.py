@@ -1,4 +1,4 @@
-"""`xrl log report`: writes a run as one page that opens in any browser without a network."""
+"""`xrl log report`: writes a report of a run as one page for any browser, without a network."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ xrl log report out/a/run.mcap --from 1200 --to 1260   # one minute of an hour
 
 
 class ReportFlags(PartFlags):
-    """Which run, and where the page goes."""
+    """Run to report, and path of the page."""
 
     file: Run
     out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None

@@ -1,4 +1,4 @@
-"""`xrl log resim`: runs a log's services again and compares their outputs with it."""
+"""`xrl log resim`: reruns a log's services and compares their outputs with the log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tools.terminal import Console, marked
 
 SERVICES: Final = ("planner", *MODULES)
 SHOWN: Final = 12
-"""Fields that are listed, those that change most first."""
+"""Maximum number of fields listed, the largest changes first."""
 
 
 EXAMPLES: Final = """
@@ -42,7 +42,7 @@ xrl log resim out/a --from 1200 --to 1260                 # one minute of a long
 
 
 class ResimFlags(ControllerFlags, PartFlags):
-    """Which run, which services, and what is other than it was."""
+    """Run and services to execute again, and what to change."""
 
     log: Run
     service: Annotated[
@@ -55,15 +55,15 @@ class ResimFlags(ControllerFlags, PartFlags):
     ] = ()
     param: Annotated[tuple[str, ...], Arg(metavar="NAME=VALUE")] = ()
     """change a key of the robot file, such as law.K_p.x=2000 or joint_service.blend_ms=100, and
-    list what the same inputs change most"""
+    list the outputs that change most"""
     tolerance: Annotated[float, Range(0.0, FINITE_MAX, ""), Arg(metavar="T")] = 0.0
-    """largest accepted difference of numbers (default 0: equal to the last bit)"""
+    """maximum accepted difference of numbers (default: 0, equal to the last bit)"""
     workers: Annotated[Count, Arg(metavar="N")] = dataclasses.field(default_factory=cores)
-    """processes for a run of over a minute (default: one for each core)"""
+    """number of processes for a run of over a minute (default: one per core)"""
 
 
 def run(flags: ResimFlags) -> int:
-    """Execute, compare, tell."""
+    """Execute again, compare, and print the differences."""
     console = Console()
     index = RunIndex(flags.log)
     part = part_of(flags, index)
@@ -73,7 +73,8 @@ def run(flags: ResimFlags) -> int:
     outcomes = _executed(ranges_of(index, task, flags.workers), flags.workers, console)
     if has_own_controller(index) and flags.controller is None and "planner" in names:
         console.print(
-            "a custom controller led this run: the planner is equal only with --controller FILE",
+            "a custom controller led this run: the planner's outputs match only with --controller "
+            "FILE",
             style="yellow",
         )
     console.print(summary(outcomes))
@@ -83,8 +84,8 @@ def run(flags: ResimFlags) -> int:
         _tell_reason(index, console)
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
-            f"{flags.log}: nothing could be executed: it has no checkpoint of these services; a "
-            "run of over a second that this version recorded has"
+            f"{flags.log}: nothing could be executed: the log has no checkpoint of these services; "
+            "record a run of over a second with this version"
         )
     if flags.param:
         return 0
@@ -136,8 +137,8 @@ def tell(outcome: ReexecutionResult, index: RunIndex, console: Console, *, chang
     first = outcome.comparison.first
     if outcome.lost_inputs:
         console.print(
-            f"{outcome.service}: the log lacks {outcome.lost_inputs} messages that it consumed; "
-            "execution continued from the next checkpoint"
+            f"{outcome.service}: the log lacks {outcome.lost_inputs} messages that the service "
+            "consumed; execution continued from the next checkpoint"
         )
     if first is None:
         return
@@ -164,7 +165,7 @@ def _short(value: object) -> str:
 
 
 def _tell_reason(index: RunIndex, console: Console) -> None:
-    """Print what the run was made with that is something else here."""
+    """Print the likely reason: versions or a machine that differ from those of the run."""
     here = {
         "run": revision.code() | provenance.machine(),
         "packages": provenance.packages(),

@@ -1,4 +1,4 @@
-"""`xrl log wearer`: measures a person's thresholds of park from a log, and writes their file."""
+"""`xrl log wearer`: measures a wearer's park thresholds from a log and writes the wearer file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tools.terminal import Console
 
 ABOUT: Final = """
 Record a minute with park off: stand, squat down and up three times without a stop, and rest in a
-crouch. The robot file lab.toml reads the person's file lab.wearer.toml beside it."""
+crouch. The robot file lab.toml reads the wearer file lab.wearer.toml beside it."""
 
 EXAMPLES: Final = """
 xrl log wearer out/anna/run.mcap
@@ -28,11 +28,11 @@ xrl log wearer out/anna/run.mcap --from 10 --to 70 --out deploy/robot.wearer.tom
 
 
 class WearerFlags(PartFlags):
-    """Whose log, and where the thresholds go."""
+    """Run to measure, and path of the wearer file."""
 
     log: Annotated[Path, positional("RUN", help=RUN_HELP)]
     out: Path | None = None
-    """file to write; without it the thresholds are only shown"""
+    """wearer file to write (default: only print the thresholds)"""
 
 
 def run(flags: WearerFlags) -> int:

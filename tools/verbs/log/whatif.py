@@ -1,4 +1,4 @@
-"""`xrl log whatif`: had something died at this moment of a recorded run, would it have stood?"""
+"""`xrl log whatif`: kills a service at each moment of a recorded run, and reports the falls."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from tools.logs.run_log import RunLog, refuse_own_controller, robot_of, text_of
 from tools.terminal import Console, marked
 
 STATE_EVERY_S: Final = 0.1 - 1e-9
-"""How often the world's state is recorded, within rounding."""
+"""Period at which the simulated world's state is recorded, less a margin for rounding, s."""
 KILLABLE: Final = ("planner", *MODULES)
 WIDTH: Final = 72
-"""Characters of a line of the strip."""
+"""Characters per line of the strip."""
 
 
 EXAMPLES: Final = """
@@ -48,7 +48,7 @@ xrl log whatif out/a/run.mcap --kill planner --from 5 --to 9
 
 
 class WhatIfFlags(PartFlags):
-    """What dies, and when."""
+    """Services to kill, and when."""
 
     log: Annotated[Path, positional("RUN", help=f"{RUN_HELP}; of a simulated robot")]
     kill: Annotated[
@@ -60,17 +60,17 @@ class WhatIfFlags(PartFlags):
         ),
     ]
     every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.1
-    """time between two moments; the state is recorded as often"""
+    """time between two kills; at least 0.1 s, the period at which the state is recorded"""
     for_s: Annotated[Duration, option("--for", metavar="S")] = 4.0
-    """duration of each continued run; pushes and hand as recorded"""
+    """duration of each continued run; pushes and hand are as recorded"""
     workers: Annotated[Count | None, Arg(metavar="N")] = None
-    """processes (default: one a core)"""
+    """number of processes (default: one per core)"""
     out: Folder | None = None
-    """for whatif.json and whatif.png (default: beside the log)"""
+    """folder for whatif.json and whatif.png (default: beside the log)"""
 
 
 def run(flags: WhatIfFlags) -> int:
-    """Go on from every moment; 0 if the robot would have stood each time."""
+    """Continue the run from every moment; return 0 if the robot would have stood each time."""
     require("sim")
     console = Console()
     log = read_asked(flags, RunIndex(flags.log), as_sent=True)
@@ -117,7 +117,7 @@ def scenario_of(log: RunLog) -> Scenario:
     """Return the scenario of a run.
 
     Raises:
-        RunError: the log does not hold it.
+        RunError: the log does not contain it.
     """
     where = f"{log.path}: scenario.toml"
     scenario = parse_toml(text_of(log, "scenario.toml"), where, Scenario)
@@ -129,7 +129,7 @@ def _plant_of(log: RunLog) -> PlantConfig:
     """Return the plant that a run was simulated with.
 
     Raises:
-        RunError: the log does not hold it.
+        RunError: the log does not contain it.
     """
     return parse_toml(text_of(log, PLANT_FILE), f"{log.path}: {PLANT_FILE}", PlantConfig)
 

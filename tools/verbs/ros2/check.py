@@ -1,4 +1,4 @@
-"""`xrl ros2 check`: what ROS 2 sees of the robot: router, node, topics, and some messages."""
+"""`xrl ros2 check`: checks what ROS 2 sees of the robot: router, node, topics and messages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ xrl ros2 check --domain 7 --router tcp/192.168.0.2:7447
 """
 LOOK_S: Final = 0.1
 LISTEN_S: Final = 2.0
-"""Shortest listening, over which messages are counted."""
+"""Minimum time over which messages are counted, s."""
 
 
 def _domain_here() -> int:
@@ -41,20 +41,20 @@ def _domain_here() -> int:
 
 
 class CheckFlags(ConfigFlags):
-    """Which network."""
+    """ROS 2 network to check."""
 
     domain: Annotated[int, parsed(rmw.domain, "N")] = dataclasses.field(
         default_factory=_domain_here
     )
-    """domain (default: $ROS_DOMAIN_ID, else 0)"""
+    """ROS domain (default: $ROS_DOMAIN_ID, else 0)"""
     router: Annotated[str | None, Arg(metavar="ENDPOINT")] = None
-    """router (default: ros2.router of the robot file)"""
+    """endpoint of the router (default: ros2.router of the robot file)"""
     wait: Seconds = 5.0
-    """longest wait for the router, for the node, and for each topic's first message"""
+    """timeout for the router, for the node, and for each topic's first message"""
 
 
 def run(flags: CheckFlags) -> int:
-    """Look, and print what was found; 0 if nothing is missing."""
+    """Check and print the findings; return 0 if nothing is missing."""
     require("ros2")
     robot = load(flags.config)
     if flags.router is not None:
@@ -78,15 +78,17 @@ class _CheckRow(NamedTuple):
     what: str
     found: str
     fix: str = ""
-    """What to do if it is not good."""
+    """Remedy if it is not good."""
 
 
 def look(robot: RobotConfig, domain: int, wait_s: float) -> list[_CheckRow]:
-    """Look at the network as a node of it."""
+    """Check the network as one of its nodes."""
     ros2, types = robot.ros2, RosTypes(robot.ros2.distribution)
     ros = _opened(ros2.router, domain, types, wait_s)
     if ros is None:
-        fix = "start it where ROS 2 is: ros2 run rmw_zenoh_cpp rmw_zenohd; or correct ros2.router"
+        fix = (
+            "start it on the ROS 2 host: ros2 run rmw_zenoh_cpp rmw_zenohd; or correct ros2.router"
+        )
         return [_CheckRow(False, f"router {ros2.router}", "does not answer", fix)]
     with ros:
         rows = [_CheckRow(True, f"router {ros2.router}", "answers")]
@@ -94,8 +96,8 @@ def look(robot: RobotConfig, domain: int, wait_s: float) -> list[_CheckRow]:
         deadline = time.monotonic() + wait_s
         while name not in (nodes := _nodes(seen := ros.graph())):
             if time.monotonic() > deadline:
-                found = f"not among: {', '.join(nodes) or 'none'}"
-                fix = f"start it: xrl up --ros2 --domain {domain}; it may be in another domain"
+                found = f"not among the nodes: {', '.join(nodes) or 'none'}"
+                fix = f"start it with xrl up --ros2 --domain {domain}, or check its domain"
                 return [*rows, _CheckRow(False, f"node {name}", found, fix)]
             time.sleep(LOOK_S)
         rows.append(_CheckRow(True, f"node {name}", "in the graph"))
@@ -114,7 +116,7 @@ def look(robot: RobotConfig, domain: int, wait_s: float) -> list[_CheckRow]:
 
 
 def _opened(router: str, domain: int, types: RosTypes, wait_s: float) -> RosSession | None:
-    """Open a session as soon as the router answers; None: it does not in time."""
+    """Open a session as soon as the router answers; return None if it does not in time."""
     deadline = time.monotonic() + wait_s
     while True:
         try:
@@ -126,7 +128,7 @@ def _opened(router: str, domain: int, types: RosTypes, wait_s: float) -> RosSess
 
 
 def _has_rate(topic: RosTopic, known: RosTopics, robot: RobotConfig) -> bool:
-    """Return True for a topic that the robot file wants; the clock is a simulated robot's."""
+    """Return True if the robot file enables a topic; the clock is only in simulation."""
     ros2 = robot.ros2
     rates = {
         known.joint_states: ros2.joint_states_hz, known.tf: ros2.tf_hz,
@@ -138,7 +140,7 @@ def _has_rate(topic: RosTopic, known: RosTopics, robot: RobotConfig) -> bool:
 def _missing(topic: RosTopic, seen: list[SeenEndpoint]) -> _CheckRow:
     others = [one for one in seen if one.kind == "MP" and one.topic == topic.name]
     found = f"with another type, {others[0].type}" if others else "not in the graph"
-    fix = "the same distribution on both sides: ros2.distribution"
+    fix = "use the same distribution on both sides: ros2.distribution"
     return _CheckRow(False, topic.name, found, fix)
 
 
@@ -164,7 +166,7 @@ def _received(
         if topic == known.joint_states:
             found += f", {len(joints)} of {len(JOINTS)} joints"
         good = count > 0 and (topic != known.joint_states or len(joints) == len(JOINTS))
-        fix = "the gateway or a service is silent: xrl status"
+        fix = "the gateway or a service is silent: see xrl status"
         rows.append(_CheckRow(good or topic == known.wrench, f"{topic.name}, received", found, fix))
     return rows
 

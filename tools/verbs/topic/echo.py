@@ -1,4 +1,4 @@
-"""`xrl topic echo`: the messages of a topic as they come."""
+"""`xrl topic echo`: prints a topic's messages as they arrive."""
 
 from __future__ import annotations
 
@@ -31,30 +31,32 @@ xrl topic echo harness/wrench --json | jq .force
 
 
 class EchoFlags(RunDirFlags):
-    """Which topics, and how much of them."""
+    """Topics to print, and how much of them."""
 
     topic: Annotated[tuple[str, ...], positional("TOPIC")]
-    """such as 'joint/*/state'"""
+    """topic, such as 'joint/*/state'"""
     field: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
     """print only this field; may be repeated"""
     hz: Annotated[Rate | None, Arg(metavar="HZ")] = None
     """at most HZ messages of each topic per second"""
     count: Annotated[Count | None, Arg(metavar="N")] = None
-    """end after N messages"""
+    """stop after N messages"""
     for_s: Annotated[Seconds | None, option("--for")] = None
-    """end after S seconds"""
+    """stop after S seconds"""
     json: bool = False
-    """a line of JSON for each message, as on the bus"""
+    """print each message as a line of JSON, as on the bus"""
 
 
 def run(flags: EchoFlags) -> int:
-    """Print until the end that was asked for; 0 if anything came."""
+    """Print until the requested end; return 0 if a message was printed."""
     keys = keys_named(flags.topic)
     for name in flags.field:
         without = [key.name for key in keys if name not in key.topic.type.__struct_fields__]
         if len(without) == len(keys):
             fields = ", ".join(keys[0].topic.type.__struct_fields__)
-            raise RunError(f"--field {name}: {keys[0].name} has no such field; it has {fields}")
+            raise RunError(
+                f"--field {name}: {keys[0].name} has no such field; its fields are {fields}"
+            )
     fleet = SupervisedFleet.attach(flags.run_dir)
     robot = fleet.manifest.robot()
     with open_session(robot, "echo", fleet.run.path) as session:
@@ -62,7 +64,7 @@ def run(flags: EchoFlags) -> int:
 
 
 def _print(session: Session, keys: list[TopicKey], flags: EchoFlags) -> int:
-    """Print the messages; return how many."""
+    """Print the messages; return their number."""
     by_key = {key.topic.key(session.robot, key.module): key for key in keys}
     stream = session.stream(list(by_key))
     stop, printed = StopFlag(), 0
@@ -89,11 +91,14 @@ def _print(session: Session, keys: list[TopicKey], flags: EchoFlags) -> int:
 
 
 def as_text(key: TopicKey, payload: bytes, fields: Sequence[str], *, as_json: bool) -> str:
-    """Return a message as text; "" if it has none of the fields, or is no message of its type."""
+    """Return a message as text; "" if it lacks all the fields.
+
+    A payload that is not a message of the topic's type is described by its size.
+    """
     try:
         message = msgspec.json.decode(payload, type=key.topic.type)
     except (msgspec.DecodeError, UnicodeDecodeError):
-        return f"{key.name}: {len(payload)} bytes that are no {key.topic.type.__name__}"
+        return f"{key.name}: {len(payload)} bytes that are not a valid {key.topic.type.__name__}"
     values = {
         name: getattr(message, name)
         for name in message.__struct_fields__
@@ -108,13 +113,13 @@ def as_text(key: TopicKey, payload: bytes, fields: Sequence[str], *, as_json: bo
 
 
 def shown(message: Message, name: str, value: Any) -> str:
-    """Return a value as a person reads it: enumerations by name, numbers short."""
+    """Return a value in readable form: enumerations by name, numbers rounded."""
     kind: type[IntEnum] | None = ENUMERATIONS.get((type(message), name))
     if kind is not None:
         try:
             return f"{kind(value).name} ({value})"
         except ValueError:
-            return f"{value}, which is no {kind.__name__}"
+            return f"{value}, which is not a valid {kind.__name__}"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, tuple):

@@ -173,7 +173,7 @@ function show(frame) {
       planner.heat_left_s >= 0 && planner.heat_left_s < 3600 ? `motors: ${planner.heat_left_s.toFixed(0)} s left at this load` : "",
       `tick ${planner.tick_us?.toFixed(0) ?? "-"} µs, assist ${planner.assist_n.toFixed(0)} N, carries ${planner.carried_n.toFixed(0)} N`]
       .filter(Boolean).join("; ")
-    : "not heard: each module holds by itself";
+    : "not heard: each module holds on its own";
   frame.modes.forEach((mode, index) => {
     const name = model.modes[mode] ?? "SILENT";
     moduleRows[index].word.textContent = name;

@@ -71,7 +71,7 @@ def test_drives_that_start_together_share_one_row_and_are_no_alarm(log: RunLog) 
     [
         ({"mode": int(PlannerMode.TRIPPED), "trip": int(Trip.SAGGING)},
          "planner: LEADING to TRIPPED, SAGGING", "bad"),
-        ({"wait_s": 3.0}, "planner: LEADING to LEADING (waits after drop-outs", "note"),
+        ({"wait_s": 3.0}, "planner: LEADING to LEADING (waits after dropouts", "note"),
         ({"heat": 1}, "heat: NONE to ", "bad"),
     ],
 )  # fmt: skip

@@ -207,7 +207,7 @@ def test_lost_messages_are_counted(log: RunLog, page: str) -> None:
             wrench["seq"] += 3
 
     page = render(runs.changed(log, {"harness/wrench": dropped}))
-    assert "<dd>3; `xrl log info` shows which</dd>" in page
+    assert "<dd>3; `xrl log info` shows the topics</dd>" in page
 
 
 def test_the_page_holds_the_inputs_of_the_run(page: str, log: RunLog) -> None:
@@ -312,7 +312,7 @@ def test_a_part_of_a_run_has_the_time_of_the_whole_and_all_events(
     out = tmp_path / "part.html"
     words = ["--from", "1", "--to", "2", "-o", str(out), "--open", "no"]
     assert cli.main(["log", "report", str(made.path), *words]) == 0
-    assert 'id="verdict">A part of a run, and its figures: no verdict<' in out.read_text()
+    assert 'id="verdict">Figures of a part of a run, without a verdict<' in out.read_text()
     data = runs.data_of(out.read_text())
     assert data["span"] == pytest.approx([1.0, 2.0], abs=1e-6)
     t, values = runs.line(data, "COM", "x")

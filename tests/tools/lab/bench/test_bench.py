@@ -122,7 +122,7 @@ def test_an_unknown_revision_is_refused_by_name_before_a_fleet_starts(
 ) -> None:
     monkeypatch.setattr(table, "run_tree", lambda *_: pytest.fail("a fleet was started"))
     assert exit_code(["bench", "fleet", "--against", "no-such"]) == 2
-    assert "no-such: no git revision here" in capsys.readouterr().err
+    assert "no-such: no such git revision" in capsys.readouterr().err
 
 
 def test_two_trees_take_turns_and_a_missed_target_is_told_by_the_exit_code(

@@ -142,23 +142,23 @@ def test_all_that_differs_is_told_in_one_line() -> None:
 
 def test_kernel_and_number_of_processors_are_no_reason() -> None:
     found = likely_reason(origin(platform="Linux-6.18", cpu_count="64"), origin())
-    assert found == "no reason known: it was recorded with the same as here"
+    assert found == "no reason known: it was recorded with the same environment as here"
 
 
 def test_what_a_log_does_not_tell_is_not_taken_for_equal() -> None:
     found = likely_reason(origin(git_commit="unknown", libc="", thread_env="[]"), origin())
     assert found.startswith("no reason known")
-    assert found.endswith("(not told: code, libc, OPENBLAS_NUM_THREADS, OPENBLAS_CORETYPE)")
-    assert "not told: code, architecture, CPU" in likely_reason({}, origin())
+    assert found.endswith("(unknown: code, libc, OPENBLAS_NUM_THREADS, OPENBLAS_CORETYPE)")
+    assert "unknown: code, architecture, CPU" in likely_reason({}, origin())
 
 
 def test_two_checkouts_with_changes_are_not_taken_for_equal() -> None:
     changed = origin(git_dirty="true")
-    assert "not told: code" in likely_reason(changed, changed)
+    assert "unknown: code" in likely_reason(changed, changed)
 
 
 def test_every_fact_is_in_what_a_log_is_given() -> None:
     here = {"run": provenance.machine(), "packages": provenance.packages()}
     told = likely_reason(here, origin())
-    assert "not told: code)" in told, "the commit is of git, which may not be there"
+    assert "unknown: code)" in told, "the commit is of git, which may not be there"
     assert set(revision.code()) <= set(RUN)

@@ -86,5 +86,5 @@ def test_one_recorded_bit_or_command_that_differs_is_found() -> None:
 
 
 def test_a_drive_status_that_there_is_not_is_an_error_in_words() -> None:
-    with pytest.raises(RunError, match="drive status 9; there are 0 to 6"):
+    with pytest.raises(RunError, match="drive status 9, but the maximum is 6"):
         executed(Changed(read_run(GOLDEN), status=9), TRACED[0])

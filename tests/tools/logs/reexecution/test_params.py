@@ -42,7 +42,7 @@ def test_the_schedule_that_was_recorded_is_used_with_the_changed_gains(robot: Ro
         ("law.K_p.9=1", "index"),
         ("law.K_p.x=soft", "no value"),
         ("law.K_p.x.y=1", "no such key"),
-        ("law=1", "law: 1 does not fit"),
+        ("law=1", "law: 1 is not valid"),
         ("law.K_p.x=-5", "law.K_p"),
         ("joint_service.loop=magic", "loop"),
     ],

@@ -1,1 +1,1 @@
-"""The crash matrix: which service dies, the expected outcome, and the judgement."""
+"""The crash matrix: the service that dies, the expected outcome, and the judgement."""

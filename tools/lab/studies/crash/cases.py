@@ -1,7 +1,7 @@
-"""The crash matrix as data: which service dies, the expected state of the robot, and why.
+"""The crash matrix as data: the service that dies, the expected state of the robot, and the reason.
 
-In every case the operator leads a squat; the crash comes on the way down, at about 1.0 m. Two
-pushes follow, then the lost services are restarted on request, and the operator leads again.
+In every case the operator leads a squat, and the crash comes on the way down, at about 1.0 m. Two
+pushes follow. Then the lost services are restarted on request, and the operator leads again.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from tools.live.scenario_runner import TriggeredKill
 
 CRASH_S: Final = 2.4
 REQUEST_S: Final = 5.0
-"""here a person requests a module in FAULT: its service is ended,"""
+"""Time at which a person requests a module in FAULT, so that its service is ended, s."""
 BACK_S: Final = 5.2
-"""and here it is started again, as is every service that was killed or stopped."""
+"""Time at which it is restarted, as is every service that was killed or stopped, s."""
 FAULT_LASTS_S: Final = 2.0
-"""A cable is in again, a supply or an encoder is there again: well before the request."""
+"""Duration of a fault of a cable, a supply or an encoder, s: it ends well before the request."""
 DURATION_S: Final = 8.0
 
 HAND: Final = (
@@ -47,18 +47,18 @@ PUSHES: Final = (
 )
 
 CRASHED: Final = tuple(name for name in SERVICES if name not in ("simulator", *OPTIONAL))
-"""Services that are killed. The simulator is the world and the drives: no robot has it."""
+"""Services to kill, except the simulator: it is the world and the drives, which a robot lacks."""
 
 
 class CrashVerdict(StrEnum):
-    """How a case came out, the best first."""
+    """Outcome of a case, best first."""
 
     STOOD = "stood"
     SANK = "sank"
-    """Not fallen, but lower than the hand ever was."""
+    """Not fallen, but lower than the hand led it."""
     FELL = "fell"
     UNJUDGED = "unjudged"
-    """The run could not be carried out to where it can be judged."""
+    """The run did not get far enough to be judged."""
 
 
 class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
@@ -66,36 +66,36 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     kind: str
-    """What sort of crash; `--quick` has at least one of each."""
+    """Kind of crash; `--quick` has at least one case of each kind."""
     crash: tuple[Kill | Fault, ...]
     expected: CrashVerdict = CrashVerdict.STOOD
-    """The worst that is allowed."""
+    """Worst allowed verdict."""
     why: str
-    """Why no better is expected, or why so much is."""
+    """Reason for that expectation."""
     before: tuple[Kill | Restart, ...] = ()
-    """What leads up to the crash."""
+    """Actions before the crash."""
     triggered_kill: TriggeredKill | None = None
     """A crash that a change of the modules' modes triggers."""
     holds: bool = True
-    """The modules that are not hit go to HOLD; False: they go on tracking."""
+    """True if the other modules go to HOLD, False if they continue to track."""
     leads_again: bool = True
-    """The request brings the module back; False: it would have to be zeroed first."""
+    """True if the request brings the module back, False if it would have to be zeroed first."""
     quick: bool = False
 
     @property
     def hit(self) -> frozenset[str]:
-        """Services and modules that the crash is of."""
+        """Services and modules that the crash hits."""
         names = {row.service if isinstance(row, Kill) else row.module for row in self.crash}
         return frozenset(names | ({self.triggered_kill.service} if self.triggered_kill else set()))
 
     @property
     def others(self) -> tuple[str, ...]:
-        """Modules that are not hit: these have to be safe."""
+        """Modules that are not hit, which must stay safe."""
         return tuple(module for module in MODULES if module not in self.hit)
 
 
 def scenario_of(case: CrashCase) -> Scenario:
-    """Return the case as a scenario, with the requests that restart what was lost."""
+    """Return the case as a scenario, with the requests that restart the lost services."""
     kills = [row for row in (*case.before, *case.crash) if isinstance(row, Kill)]
     down = [row.service for row in case.crash if isinstance(row, Kill)]
     down += [case.triggered_kill.service] if case.triggered_kill else []
@@ -129,21 +129,21 @@ def describe(case: CrashCase) -> str:
         many = "all modules track" if case.triggered_kill.modules > 1 else "the first module tracks"
         words.append(f"{case.triggered_kill.service} KILL {when} {many} again")
     words += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
-    return f"{', '.join(words)}; asked back at {BACK_S:g} s"
+    return f"{', '.join(words)}; requested back at {BACK_S:g} s"
 
 
 LIMP: Final = {
     "ankle": (
         CrashVerdict.FELL,
-        "nothing turns its sole against the floor: a push to its side tips it",
+        "no torque turns its sole against the floor: a push to its side tips it",
     ),
     "knee": (
         CrashVerdict.STOOD,
-        "the other five stiffen, and its leg stands as a strut on a stiff hip",
+        "the other five stiffen, and its leg acts as a strut on a stiff hip",
     ),
     "hip": (CrashVerdict.STOOD, "the other hip carries the torso's pitch alone"),
 }
-"""Allowed outcomes of a robot with one limp module, by the kind of module, and why."""
+"""Allowed outcome and its reason for a robot with one limp module, by the kind of module."""
 
 _LEFT: Final = ("hip_left", "knee_left", "ankle_left")
 FAULTED: Final[tuple[tuple[FaultKind, Sequence[str], str, str], ...]] = (
@@ -161,18 +161,18 @@ FAULTED: Final[tuple[tuple[FaultKind, Sequence[str], str, str], ...]] = (
     ("bus_full", ("knee_left",), "", "dead bus"),
     ("bus_flap", ("knee_left",), "", "dead bus"),
 )
-"""Kind, modules, the module of the short run, and sort of crash.
+"""Fault, modules, the module of the short run, and kind of crash.
 
-Left and right are mirrored, and one module is enough where a module is limp as `disarmed` leaves it
-and only the error's name differs. On a dead bus a drive holds its last target."""
+Left and right are mirrored. One module is enough where the fault leaves it as limp as `disarmed`
+does, and only the error's name differs. On a dead bus a drive holds its last target."""
 _DEAD_BUS: Final = ("no_ack", "bus_full", "bus_flap")
 _LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature", *_DEAD_BUS)
-_FREE: Final = "each drive holds by its own loop, and needs neither its service nor the others'"
+_FREE: Final = "each drive holds with its own loop, and needs neither its service nor the others'"
 _NEITHER: Final = "HOLD needs neither"
 
 
 def killed(*services: str, signal: str = "KILL") -> tuple[Kill, ...]:
-    """Return these services crashed at once."""
+    """Return simultaneous crashes of these services."""
     row = {"at": CRASH_S, "signal": signal}
     return tuple(msgspec.convert({**row, "service": name}, Kill) for name in services)
 
@@ -184,14 +184,14 @@ def fault(module: str, kind: FaultKind) -> Fault:
 
 
 def _lost(service: str, signal: str) -> CrashCase:
-    """Return the case of one service that dies, or is frozen."""
+    """Return the case of one service that dies or is suspended."""
     is_joint, is_planner = service in MODULES, service == "planner"
     if is_joint:
-        why = "its drive holds the module by its own loop; the planner has the others hold"
+        why = "its drive holds the module with its own loop; the planner makes the others hold"
     elif is_planner:
-        why = "commands grow old, and all six modules hold on their own gains"
+        why = "commands become stale, and all six modules hold on their own gains"
     else:
-        why = "balance needs nothing from it"
+        why = "balance does not need it"
     how = "kill" if signal == "KILL" else "stop"
     vital = is_joint or is_planner
     return CrashCase(
@@ -208,10 +208,10 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCa
     """Return the case of one drive's fault."""
     name: str = kind
     expected = CrashVerdict.STOOD
-    # a knee moves on the way down: its count jumps at the gap's end, which is an overspeed
+    # a knee moves on the way down, so its count jumps when the gap ends, which is an overspeed
     hardly_moves = kind == "encoder_gap" and kind_of(module) != "knee"
     if hardly_moves:
-        why = "the joint hardly moves meanwhile: the drive holds through it"
+        why = "the joint hardly moves in the gap, so the drive holds through it"
     elif not DRIVE_FAULTS[kind].limp and kind != "encoder_gap":
         name = "unplugged" if kind == "link_lost" else kind
         why = "the drive holds its last target; its service has lost contact"
@@ -231,7 +231,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCa
 
 
 def _reengaging(name: str, why: str, modules: int, after_s: float) -> CrashCase:
-    """Return the planner killed again as it comes back."""
+    """Return the case of a planner that is killed again while it re-engages."""
     return CrashCase(
         name=f"reengaging-{name}",
         kind="planner killed during re-engagement",
@@ -248,7 +248,7 @@ def _all_joints(name: str, *crash: Kill | Fault, quick: bool = False) -> CrashCa
 
 
 def _pair(name: str, *crash: Kill | Fault, why: str = _FREE, **changes: Any) -> CrashCase:
-    """Return the case of two things that are lost at once."""
+    """Return the case of two losses at once."""
     return CrashCase(name=f"pair-{name}", kind="pair", crash=crash, why=why, **changes)
 
 
@@ -264,7 +264,7 @@ CASES: Final[Sequence[CrashCase]] = (
         for module in modules
     ),
     _reengaging("first", "the first module tracks, and others may hold: all hold again", 1, 0.0),
-    _reengaging("blend", "half way from HOLD to TRACK: the blend freezes where it is", 6, 0.15),
+    _reengaging("blend", "halfway from HOLD to TRACK: the blend freezes where it is", 6, 0.15),
     _all_joints("kill-all-joints", *killed(*MODULES), quick=True),
     _all_joints("stop-all-joints", *killed(*MODULES, signal="STOP")),
     _all_joints("kill-all-and-planner", *killed("planner", *MODULES)),
@@ -289,7 +289,7 @@ CASES: Final[Sequence[CrashCase]] = (
         fault("hip_right", "disarmed"),
         _HIP,
         expected=CrashVerdict.FELL,
-        why="nothing holds the torso's pitch any more but the hand",
+        why="only the hand still holds the torso's pitch",
     ),
     _pair(
         "limp-knees",
@@ -298,4 +298,4 @@ CASES: Final[Sequence[CrashCase]] = (
         why="both legs fold",
     ),
 )
-"""The whole matrix, in the order in which it is run."""
+"""The whole matrix, in running order."""

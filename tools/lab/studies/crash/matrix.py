@@ -1,6 +1,6 @@
-"""`xrl study crash`: one thing after the other dies on a live fleet, and the robot is judged.
+"""`xrl study crash`: parts of a live fleet die one after the other, and the robot is judged.
 
-The verdict comes from the live bus and not from the log: the recorder may be the service that died.
+The verdict comes from the live bus, not from the log, because the recorder may be the dead service.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ from tools.terminal import Console, marked
 Show = Callable[[LiveSnapshot], None]
 
 TRIES: Final = 2
-"""A run that was disturbed by the machine, or could not be carried out, is made again; not one in
-which the robot fell: a fall stays a fall, and its log is kept."""
+"""Maximum number of tries. A run that the machine disturbed, or that did not get far enough, is
+repeated, but never one in which the robot fell; the log of a fall is kept."""
 SANK_M: Final = 0.05
-"""So far below where the torso was, and where the hand led, a robot has sunk. HOLD's springs
-and the hand give way by 0.01 m."""
+"""A robot has sunk if its torso is this far below both its height at the crash and the hand's
+lowest, m. HOLD's springs and the hand give way by 0.01 m."""
 UNSAFE: Final = (Mode.FAULT, Mode.DAMP, Mode.DISARMED)
-"""What no module that was not hit may come to."""
+"""Modes that a module that was not hit must not enter."""
 
 
 class CrashMessages(NamedTuple):
@@ -76,45 +76,45 @@ class CrashMessages(NamedTuple):
 
     truth: Sequence[SimTruth]
     events: Sequence[tuple[str, JointEvent]]
-    """With the module, in the order of each module."""
+    """With their modules, in order for each module."""
     actions: Sequence[RunEvent]
-    """Actions on the run."""
+    """Kills, restarts and other actions on the run."""
     modes: Sequence[str]
-    """The modules at the end, as in `scenario_runner.LiveSnapshot`."""
+    """Modes of the modules at the end, as in `scenario_runner.LiveSnapshot`."""
     died: Sequence[str] = ()
     """Services that ended without a request."""
 
 
 class CrashResult(msgspec.Struct, frozen=True, kw_only=True):
-    """The figures of a case; None where there is nothing to measure.
+    """The figures of a case; None where nothing was measured.
 
     "Before" and "after" refer to the crash; restarts come later.
     """
 
     verdict: CrashVerdict
     fell_after_s: float | None = None
-    """From the crash to the fall."""
+    """Time from the crash to the fall, s."""
     safe_ms: float | None = None
-    """From the crash to HOLD, slowest of the modules that were not hit; None: not all held."""
+    """Time from the crash to HOLD, slowest of the modules not hit; None if not all held."""
     torque_step_nm: float | None = None
-    """Largest step of their torques as they went to HOLD, N m."""
+    """Largest step of their torques on entering HOLD, N m."""
     torque_step_back_nm: float | None = None
     """Largest step of any module's torque at a change of mode after the request, N m."""
     leads_again_s: float | None = None
-    """From the restart to the last module's TRACK; None: not all track, or never ceased to."""
+    """Restart to last TRACK, s; None if a module does not track or none ever left TRACK."""
     com_x_mm: float | None = None
-    """Farthest after the crash, with its sign."""
+    """Largest value after the crash, with its sign."""
     com_y_mm: float | None = None
     sank_mm: float | None = None
-    """How far the torso came below where it was at the crash and where the hand led to."""
+    """Distance of the torso below both its height at the crash and the hand's lowest."""
     sole_tilt_max_rad: float | None = None
     in_real_time: bool = True
-    """False: the machine was too slow, and the figures are not those of a robot."""
+    """False if the machine was too slow, so that the figures are not those of a robot."""
     remarks: str | None = None
     """Deviations from the expected outcome, as text."""
     tries: int = 1
     wall_s: float = 0.0
-    """Start and stop of the fleet included."""
+    """Includes start and stop of the fleet."""
 
 
 def unjudged(reason: str) -> CrashResult:
@@ -123,14 +123,14 @@ def unjudged(reason: str) -> CrashResult:
 
 
 def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> CrashResult:
-    """Return what came of a run."""
+    """Return the figures of a run."""
     truth = [row for row in messages.truth if row.scenario_s >= 0.0]
     if not truth:
-        return unjudged("the scenario never began")
+        return unjudged("the scenario never started")
     zero_ns = truth[0].t_ns - round(truth[0].scenario_s * NS_PER_S)
     crash_s = _crash_s(case, messages.actions)
     if crash_s is None:
-        return unjudged("its moment never came: the modules did not track again in time")
+        return unjudged("the kill was never triggered: the modules did not track again in time")
     after = [row for row in truth if row.scenario_s >= crash_s]
     if not after:
         return unjudged(f"ended at {truth[-1].scenario_s:.1f} s, before the crash")
@@ -156,11 +156,11 @@ def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> Cra
         return unjudged(f"ended at {last.scenario_s:.1f} s of {scenario.duration:g} s")
     elif why_not_standing(last, robot):
         verdict = CrashVerdict.FELL
-        remarks.append("not down yet at the end, but tipping")
+        remarks.append("tipping at the end, but not fallen yet")
     elif sank > SANK_M:
         verdict = CrashVerdict.SANK
     remarks += _remarks(case, safe_ms, reaction)
-    remarks += [f"{name} ended by itself" for name in messages.died]
+    remarks += [f"{name} ended on its own" for name in messages.died]
     leads = all(mode == "T" for mode in messages.modes)
     if verdict is not CrashVerdict.FELL and not leads and case.leads_again:
         remarks.append(f"does not lead again: {''.join(messages.modes)}")
@@ -188,7 +188,7 @@ def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> Cra
 
 
 def _crash_s(case: CrashCase, actions: Sequence[RunEvent]) -> float | None:
-    """Return the scenario time of the crash, s: of the triggered kill, if there is one."""
+    """Return the scenario time of the crash or of the triggered kill, s."""
     until_s = REQUEST_S - END_TOLERANCE_S
     kills = [row.scenario_s for row in actions if row.kind == RunEventKind.KILLED]
     kills = [at_s for at_s in kills if at_s < until_s]
@@ -201,7 +201,7 @@ def _crash_s(case: CrashCase, actions: Sequence[RunEvent]) -> float | None:
 def _safe_ms(
     case: CrashCase, events: Sequence[tuple[str, JointEvent]], crash_ns: int, request_ns: int
 ) -> float | None:
-    """Return the time until every module that was not hit has left TRACK for HOLD, ms."""
+    """Return the time until every module not hit has changed from TRACK to HOLD, ms."""
     took = []
     for module in case.others:
         own = [event for name, event in events if name == module and event.t_ns < request_ns]
@@ -217,7 +217,7 @@ def _safe_ms(
 def _remarks(
     case: CrashCase, safe_ms: float | None, reaction: Sequence[tuple[str, JointEvent]]
 ) -> list[str]:
-    """Return the unexpected changes of mode of modules that were not hit, as text."""
+    """Return the unexpected mode changes of modules that were not hit, as text."""
     others = [(name, event) for name, event in reaction if name in case.others]
     changed = sorted({name for name, _ in others})
     words = []
@@ -241,9 +241,9 @@ def _remarks(
 def run_case(
     case: CrashCase, robot: RobotConfig, out: Path, show: Show, *, seed: int = 0
 ) -> CrashResult:
-    """Run a case, a second time if the first was disturbed and the robot stood.
+    """Run a case, and run it again if the first try was disturbed and the robot stood.
 
-    `out` is the folder of the case; `show` sees the run while it lasts.
+    `out` is the folder of the case; `show` receives the run's snapshots.
     """
     begin_s = time.monotonic()
     tries = 0
@@ -260,7 +260,7 @@ def run_case(
     allowed = is_good({"verdict": outcome.verdict, "expected": case.expected})
     if allowed and outcome.verdict is not CrashVerdict.FELL:
         for log in out.glob("*.mcap"):
-            log.unlink()  # 6 MB each, and there is nothing to look for in it
+            log.unlink()  # 6 MB each, and without a fault to search for
     return outcome
 
 
@@ -300,13 +300,13 @@ def _run_once(case: CrashCase, robot: RobotConfig, out: Path, show: Show, seed: 
             verb="crash", seed=seed, true_plant=PlantConfig(), no_restart=down,
         )  # fmt: skip
     except (RunError, FleetError) as error:
-        lines = str(error).splitlines()  # a service's log ends with its error
+        lines = str(error).splitlines()  # the last line of a service's log is its error
         return unjudged(": ".join(dict.fromkeys((lines[0], lines[-1].strip()))))
     return measure(case, run, robot)
 
 
 def died_of(services: Sequence[ServiceInfo], actions: Sequence[RunEvent]) -> list[str]:
-    """Return the services that ended without a request, by their states and the actions on them."""
+    """Return the services that ended without a request, by their states and the run's actions."""
     last = {row.subject: row.kind for row in actions}
     return [
         service.name
@@ -318,16 +318,16 @@ def died_of(services: Sequence[ServiceInfo], actions: Sequence[RunEvent]) -> lis
 
 TABLE: Final = "cases.csv"
 CASE_S: Final = 14.0
-"""Duration of a case, start and stop of its fleet included, s."""
+"""Duration of a case including start and stop of its fleet, s."""
 UNJUDGED_MAX: Final = 3
-"""After this many cases in a row that cannot be judged, the machine is at fault, not the robot."""
+"""After this many unjudged cases in a row the machine is at fault, not the robot."""
 SHOWN: Final = {
     CrashVerdict.STOOD: (0, "green"),
     CrashVerdict.SANK: (FAULT_EXIT_CODE, "yellow"),
     CrashVerdict.FELL: (FELL_EXIT_CODE, "red"),
     CrashVerdict.UNJUDGED: (RunError.exit_code, "magenta"),
 }
-"""Exit code and colour."""
+"""Exit code and colour of each verdict."""
 COLUMNS: Final = (
     ("fell", "fell_after_s", ".2f"),
     ("safe", "safe_ms", ".0f"),
@@ -339,10 +339,10 @@ COLUMNS: Final = (
 )
 """Heading, figure, format."""
 LEGEND: Final = (
-    "may: what is allowed, if not to stand only; fell: s from the crash; safe: ms from it to "
-    "HOLD, slowest of the modules not hit; step: N m, largest of their torques then; back: N m, "
-    "largest of any module after the request; leads: s from the restart to the last TRACK; "
-    "x, y: mm, COM farthest from the middle after the crash"
+    "may: allowed outcome other than stood; fell: s after the crash; safe: ms from the crash to "
+    "HOLD, slowest of the modules not hit; step: N m, largest torque step of these modules then; "
+    "back: N m, largest of any module after the request; leads: s from the restart to the last "
+    "TRACK; x, y: mm, largest distance of the COM from the middle after the crash"
 )
 
 EXAMPLES: Final = """
@@ -355,7 +355,7 @@ xrl study crash --list
 
 
 class CrashFlags(ConfigFlags):
-    """Which cases."""
+    """Cases to run."""
 
     quick: bool = False
     """one case of each kind, in 5 minutes or less"""
@@ -372,11 +372,11 @@ class CrashFlags(ConfigFlags):
         ),
     ] = None
     seed: Natural = 0
-    """of the sensors' noise"""
+    """seed of the sensors' noise"""
 
 
 def run(flags: CrashFlags) -> int:
-    """Run the matrix; 0 only if no case came out worse than it may."""
+    """Run the matrix; return 0 only if no case was worse than allowed."""
     console = Console()
     cases = select(CASES, quick=flags.quick, only=flags.only)
     if flags.list:
@@ -402,12 +402,12 @@ def run(flags: CrashFlags) -> int:
 
 
 def select(cases: Sequence[CrashCase], *, quick: bool, only: Sequence[str]) -> list[CrashCase]:
-    """Return the selected cases, in their order."""
+    """Return the selected cases, in their original order."""
     for name in only:
         if not any(fnmatchcase(case.name, name) for case in cases):
             near = difflib.get_close_matches(name, [case.name for case in cases], n=3, cutoff=0.4)
             hint = f"perhaps {', '.join(near)}; " if near else ""
-            raise RunError(f"--only {name}: no such case; {hint}`xrl study crash --list` has all")
+            raise RunError(f"--only {name}: no such case; {hint}`xrl study crash --list` lists all")
     return [
         case
         for case in cases
@@ -427,13 +427,13 @@ def row_of(case: CrashCase) -> dict[str, object]:
 
 
 def is_good(row: Mapping[str, Any]) -> bool:
-    """Return True if the robot came out of a case no worse than it may."""
+    """Return True if a case was no worse than allowed."""
     order = list(CrashVerdict)
     return order.index(row["verdict"]) <= order.index(row["expected"])
 
 
 def exit_code(rows: Sequence[Row]) -> int:
-    """Return the exit code of what came out worse than it may."""
+    """Return the exit code of the cases that were worse than allowed."""
     return worst(SHOWN[row["verdict"]][0] for row in rows if not is_good(row))
 
 
@@ -445,7 +445,7 @@ def _fill(
     out: Path,
     console: Console,
 ) -> None:
-    """Run the cases that the table lacks, each written as it is done."""
+    """Run the cases that the table lacks, and write each when it is done."""
     unjudged = 0
     words = "{task.completed}/{task.total}  {task.fields[case]}  {task.fields[now]}"
     with bar(words, console) as progress:
@@ -494,7 +494,7 @@ def _line_of(row: Row) -> Text:
 
 
 def show(rows: Sequence[Row], console: Console) -> None:
-    """Print the verdict table and the sentence under it."""
+    """Print the verdict table, and a summary line below it."""
     table = Table(title="Verdict", title_justify="left", box=None, padding=(0, 1, 0, 0))
     for heading in ("case", "verdict", "may", *(heading for heading, _, _ in COLUMNS)):
         is_text = heading in ("case", "verdict", "may")

@@ -1,1 +1,1 @@
-"""Studies over many lockstep runs: cases drawn from a seed, run over processes, in one table."""
+"""Studies over many lockstep runs: seeded cases, spread over processes, in one table."""

@@ -1,4 +1,4 @@
-"""What the studies have in common: a run in virtual time, which rows count, endings, figures."""
+"""Shared code of the studies: a run in virtual time, the rows that count, endings, figures."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ END_TOLERANCE_S: Final = 0.1
 
 
 class Observer(NamedTuple):
-    """Callbacks of a run; the default sees nothing."""
+    """Callbacks of a run; the defaults do nothing."""
 
     record: Record = forget
-    """Takes every message."""
+    """Receives every message."""
     watch: Watch = lambda _row: None
-    """Sees every row of the world, also those that do not count."""
+    """Receives every row of the world, including those that do not count."""
     after_fall_s: float = 0.0
-    """How long the trial continues after a fall, at which measurement ends."""
+    """Time for which the trial continues after a fall, s; the measurement ends at the fall."""
 
 
 NOBODY: Final = Observer()
 
 
 class Case(Protocol):
-    """A drawn case: everything that decides its run, beside the robot."""
+    """A drawn case: everything that determines its run, besides the robot."""
 
     @property
     def number(self) -> int:
-        """Its number, from 0 on."""
+        """Its number, from 0."""
 
     def scenario(self, robot: RobotConfig) -> Scenario:
-        """Return what happens."""
+        """Return the case as a scenario."""
 
     def true_plant(self) -> PlantConfig:
         """Return the simulated robot."""
@@ -61,17 +61,17 @@ def ignore(_fleet: Lockstep, _row: SimTruth) -> None:
 
 
 class CaseRun(NamedTuple):
-    """What counts of a run: all until its end or the fall."""
+    """The part of a run that counts, until its end or the fall."""
 
     rows: Sequence[SimTruth]
     events: Sequence[tuple[str, JointEvent]]
-    """Changes of mode with their modules."""
+    """Changes of mode, with their modules."""
     messages: Sequence[tuple[str, Message]]
-    """Messages of the kinds that were asked for, with their modules."""
+    """Messages of the requested kinds, with their modules."""
 
     @property
     def began(self) -> bool:
-        """False if the scenario never began: the robot fell before, or the modules never track."""
+        """False if the scenario never started: the robot fell first, or not all modules tracked."""
         return bool(self.rows) and self.rows[0].scenario_s >= 0.0
 
     def ended(self, end_s: float, robot: RobotConfig) -> dict[str, Any]:
@@ -97,9 +97,9 @@ def run_fleet(
 ) -> CaseRun:
     """Run a case in virtual time to its end or to the fall.
 
-    Rows count from the scenario time `from_s` on. The network is that of every link, beside the
-    scenario's own impairments. Messages of the kinds `kept` are kept. `each` is called with every
-    row, before the observer.
+    Rows count from the scenario time `from_s`. The network applies to every link, in addition to
+    the scenario's own impairments. Messages of the kinds `kept` are kept. `each` receives every
+    row before the observer.
     """
     messages: list[tuple[str, Message]] = []
 
@@ -128,19 +128,19 @@ def run_fleet(
 
 
 class ReactingPerson:
-    """A hand that stops where it is, some time after the wearer is told that the robot holds.
+    """A hand that stops some time after the wearer is told that the robot holds.
 
-    `xrl cue` tells them. A scripted hand leads on instead: a person who notices nothing.
+    `xrl cue` tells the wearer. A scripted hand keeps leading, like a person who notices nothing.
     """
 
     def __init__(self, reacts_s: float) -> None:
-        """Take the time from the cue to the stop, s; people need 0.2 to 0.4."""
+        """Store the time from the cue to the stop, s; people need 0.2 to 0.4."""
         self._reacts_s = reacts_s
         self._stops_s: float | None = None
         self._stopped = False
 
     def __call__(self, fleet: Lockstep, row: SimTruth) -> None:
-        """See a row of the world; stop the hand once it is time."""
+        """Check a row of the world, and stop the hand when the time is up."""
         if self._stopped or row.scenario_s < 0.0:
             return
         if self._stops_s is None:
@@ -157,7 +157,7 @@ class ReactingPerson:
 
 
 def until_fall(run: Iterable[SimTruth]) -> list[SimTruth]:
-    """Run to the end, or to the fall: the last row then."""
+    """Run to the end, or to the fall, which is then the last row."""
     rows = list[SimTruth]()
     for row in run:
         rows.append(row)
@@ -167,18 +167,18 @@ def until_fall(run: Iterable[SimTruth]) -> list[SimTruth]:
 
 
 class Ending(StrEnum):
-    """How a case came out."""
+    """Outcome of a case."""
 
     STOOD = "stood"
     FELL = "fell"
     TIPPING = "tipping"
-    """Not down yet at the end, but a sole is up or the COM beyond the soles: it will fall."""
+    """Not fallen at the end, but a sole has lifted or the COM is beyond the soles: it will fall."""
     UNREADY = "unready"
-    """The robot stands, but the six modules never came to track: there was no scenario."""
+    """The robot stands, but not all six modules tracked, so the scenario did not start."""
 
 
 class Ended(msgspec.Struct, frozen=True, kw_only=True):
-    """The first figures of every outcome."""
+    """The first figures of every result."""
 
     ending: Ending
     fell_at_s: float | None = None
@@ -200,19 +200,19 @@ EXIT_CODES: Final = {
 
 
 def worst(codes: Iterable[int]) -> int:
-    """Return the exit code of many cases by their own: a fall before all else, then a fault."""
+    """Return the exit code of many cases: a fall takes precedence, then a fault."""
     return max(codes, key=lambda code: (code == FELL_EXIT_CODE, code), default=0)
 
 
 def ending_of(last: SimTruth, end_s: float, robot: RobotConfig) -> Ending:
-    """Return how a case came out that ends at a scenario time, by the last row that counts."""
+    """Return the outcome of a case from its last row that counts and its planned end, s."""
     if last.fallen or last.scenario_s < end_s - END_TOLERANCE_S:
         return Ending.FELL
     return Ending.TIPPING if why_not_standing(last, robot) else Ending.STOOD
 
 
 def com_max_mm(rows: Sequence[SimTruth]) -> float:
-    """Return the largest horizontal distance of the COM from the middle of the ankles, mm."""
+    """Return the largest horizontal distance of the COM from midway between the ankles, mm."""
     return 1e3 * max(math.hypot(*row.over) for row in rows)
 
 
@@ -227,7 +227,7 @@ def sole_tilt_max_rad(rows: Sequence[SimTruth]) -> float:
 
 
 def scalars(case: msgspec.Struct) -> dict[str, object]:
-    """Return the draws of a case that fill one column each."""
+    """Return the draws of a case that each fill one column."""
     values = msgspec.structs.asdict(case)
     return {name: value for name, value in values.items() if not isinstance(value, tuple)}
 
@@ -243,16 +243,16 @@ def event_steps_nm(events: Iterable[JointEvent]) -> list[float]:
 
 
 def wilson(hits: int, of: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share that was seen in some trials (E. B. Wilson, 1927).
+    """Return the 95 % interval of a fraction that was observed in trials (E. B. Wilson, 1927).
 
-    The trials are independent of each other. It holds for one share: of several intervals, the
-    worst is missed more often than once in 20.
+    The trials must be independent. The interval is for one fraction: among several intervals, the
+    worst is wrong more often than once in 20.
     """
     interval = stats.binomtest(hits, of).proportion_ci(method="wilson")
     return float(interval.low), float(interval.high)
 
 
 def parted(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
-    """Return the cases that stood to the end, and the others."""
+    """Return the cases that stood to the end, and the other cases."""
     standing = [row for row in rows if row["ending"] == Ending.STOOD]
     return standing, [row for row in rows if row["ending"] != Ending.STOOD]

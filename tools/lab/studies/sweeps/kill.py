@@ -1,6 +1,6 @@
-"""`xrl study kill`: the planner killed at random, in random postures and under pushes.
+"""`xrl study kill`: kills the planner at random, in random postures and under pushes.
 
-A case follows from the seed and its number alone.
+The seed and the number of a case determine it.
 """
 
 from __future__ import annotations
@@ -55,28 +55,28 @@ from tools.sim.lockstep import Lockstep
 from tools.terminal import Console
 
 PAYLOADS: Final = 5
-"""kg, evenly spaced from none to `mass.payload_max`: each needs a gain schedule of its own."""
+"""kg, evenly spaced from 0 to `mass.payload_max`; each needs its own gain schedule."""
 HEIGHT: Final = (0.79, 1.2)
 """m, torso above the ankles: from the crawl to standing."""
 HEIGHT_UPRIGHT: Final = (0.85, 1.2)
-"""m: the person squats, the torso stays upright."""
+"""m; for a squat with an upright torso."""
 PITCH_MAX: Final = 1.2
-"""rad: the crawl's."""
+"""rad, as in the crawl."""
 LIMIT_MARGIN: Final = 0.05
-"""rad that a posture keeps from the joint limits."""
+"""Minimum distance of a posture from the joint limits, rad."""
 PACE: Final = (0.8, 1.6)
-"""Times `SPEED`."""
+"""Factors on `SPEED`."""
 SPEED: Final = (0.1, 0.24, 40.0)
 """m/s, rad/s, N/s: mean speeds of the squat (height) and of the crawl (pitch, assist)."""
 LEG_MIN_S: Final = 1.0
 START_S: Final = 0.5
-"""Standing still before the first leg."""
+"""Time that the robot stands still before the first leg, s."""
 STILL_S: Final = (0.3, 1.0)
-"""Standing still before the kill, in the cases that are not moving."""
+"""Time that it stands still before the kill, in cases without motion, s."""
 LET_GO_S: Final = 1.0
-"""At most so long before the kill."""
+"""Maximum time from letting go to the kill, s."""
 PUSH_SHARE: Final = (0.1, 1.0)
-"""Shares of the hardest push that is drawn (`PushRange`)."""
+"""Fractions of the largest drawn push (`PushRange`)."""
 PUSH_S: Final = 0.3
 PUSHES_MAX: Final = 3
 PUSH_COLUMNS: Final = ("at_s", "x_n", "y_n")
@@ -84,8 +84,8 @@ POSES_MAX: Final = 2
 AFTER_KILL_S: Final = 3.0
 AFTER_PUSH_S: Final = 1.7
 AFTER_LEAD_S: Final = 2.0
-"""How long a case goes on after the kill, the last push and, hand on, the end of the way: an
-operator who leads on against a robot that holds tips it slowly."""
+"""Time that a case continues after the kill, the last push and, with the hand on, the end of the
+way, s: an operator who keeps leading a robot that holds tips it slowly."""
 DELAY_MAX_MS: Final = 20.0
 
 
@@ -96,28 +96,28 @@ class KillCase(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     payload_kg: float
     way: tuple[Keyframe, ...]
-    """Standing, then one or two poses that the operator leads to."""
+    """Standing, then one or two poses to which the operator leads."""
     pace: float
     moving: bool
-    """True: killed on the way to the last pose; False: after it has been reached."""
+    """True if killed on the way to the last pose, False if killed after it was reached."""
     way_end_s: float
-    """When the operator is at the last pose, with the hand on."""
+    """Time at which the operator reaches the last pose, with the hand on."""
     kill_s: float
     let_go_s: float | None
-    """When the operator takes the hand off; None: never. The rested weight stays."""
+    """Time at which the operator takes the hand off, or None. The rested weight stays."""
     delay_ms: float
     pushes: tuple[Push, ...]
 
     @property
     def end_s(self) -> float:
-        """When there is nothing more to wait for."""
+        """End of the case, when no effect is left to wait for."""
         quiet = [push.at + push.duration + AFTER_PUSH_S for push in self.pushes]
         if self.let_go_s is None:
             quiet.append(self.way_end_s + AFTER_LEAD_S)
         return max([self.kill_s + AFTER_KILL_S, *quiet])
 
     def scenario(self, _robot: RobotConfig) -> Scenario:
-        """Return the case as a scenario; the hand that lets go is not in it."""
+        """Return the case as a scenario, which does not include letting go."""
         return Scenario(
             name=f"kill-{self.seed}-{self.number}",
             about=f"case {self.number} of `xrl study kill --seed {self.seed}`",
@@ -128,12 +128,12 @@ class KillCase(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def true_plant(self) -> PlantConfig:
-        """Return the simulated robot: all errors drawn."""
+        """Return the simulated robot, with all errors drawn at random."""
         return plants.draw(f"kill {self.seed} {self.number}")
 
 
 def payloads(robot: RobotConfig) -> tuple[float, ...]:
-    """Return the payloads that are drawn from, kg."""
+    """Return the payloads to draw from, kg."""
     highest = robot.mass.payload_max
     return tuple(round(highest * i / (PAYLOADS - 1), DIGITS) for i in range(PAYLOADS))
 
@@ -148,12 +148,12 @@ class KillCases:
     """The cases of a robot."""
 
     def __init__(self, robot: RobotConfig, push: float = SHARE) -> None:
-        """Take the robot, and up to which share of what it bears it is pushed."""
+        """Store the robot, and the largest push as a fraction of what the body withstands."""
         self._robot, self._push = robot, push
         self._by_payload: dict[float, tuple[RobotConfig, PushRange]] = {}
 
     def draw(self, seed: int, number: int) -> KillCase:
-        """Return one case; no other case has to be drawn for it."""
+        """Return one case, which does not depend on any other case."""
         dice = random.Random(f"kill {seed} {number}")
         payload = dice.choice(payloads(self._robot))
         loaded, pushes = self._of(payload)
@@ -190,7 +190,7 @@ class KillCases:
 
 
 def _draw_pose(dice: random.Random, robot: RobotConfig) -> tuple[float, float, float]:
-    """Draw height and pitch that the legs reach, and in half of the cases a weight on them."""
+    """Draw height and pitch within reach, and in half of the cases a resting weight."""
     while True:
         upright = dice.random() < 0.5
         height = uniform(dice, *(HEIGHT_UPRIGHT if upright else HEIGHT))
@@ -202,7 +202,7 @@ def _draw_pose(dice: random.Random, robot: RobotConfig) -> tuple[float, float, f
 
 
 def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> list[Push]:
-    """Draw pushes around and after the kill, none over another."""
+    """Draw pushes around and after the kill, without overlap."""
     count = dice.randint(1, PUSHES_MAX)
     around = dice.random() < 0.3
     early, late = (-0.5, 0.05) if around else (0.1, 0.8)
@@ -215,9 +215,9 @@ def _draw_pushes(dice: random.Random, kill_s: float, drawn_from: PushRange) -> l
 
 
 def reachable(robot: RobotConfig, height: float, pitch: float) -> bool:
-    """Return True if the legs hold the torso so, COM over the ankles, inside the limits.
+    """Return True if the pose, with the COM over the ankles, is within the joint limits.
 
-    The torso's masses lie at its origin: its pitch moves no COM, only the hips.
+    The torso's masses are at its origin, so its pitch moves only the hips, not the COM.
     """
     pose = list(stand_pose(robot, height))
     for hip in (5, 11):
@@ -243,7 +243,7 @@ def _way(
 
 
 def row_of(case: KillCase) -> dict[str, object]:
-    """Return every draw by its column; None where there was no such draw."""
+    """Return every draw by its column; None for draws that the case lacks."""
     row = scalars(case) | {"moving": int(case.moving)}
     units = {"height": "m", "pitch": "rad", "assist": "n"}
     for index in range(1, POSES_MAX + 1):
@@ -259,29 +259,29 @@ def row_of(case: KillCase) -> dict[str, object]:
 
 
 class _KillResult(Ended, frozen=True, kw_only=True):
-    """The figures of a case; None where there is nothing to measure.
+    """The figures of a case; None where nothing was measured.
 
-    "After" is from the kill on, "before" from the scenario's start to the kill.
+    "After" is the time from the kill, "before" from the scenario's start to the kill.
     """
 
     kill_height_m: float | None = None
-    """Torso, as it was at the kill."""
+    """Height of the torso at the kill."""
     kill_pitch_rad: float | None = None
     kill_margin: float | None = None
     """Failsafe certificate of the last commands (docs/law.md#certificate)."""
     kill_margin_onboard: float | None = None
     holds_before: int = 0
-    """Drop-outs from TRACK of the busiest module, the planner alive."""
+    """Dropouts from TRACK of the module with the most, while the planner is alive."""
     operator_peak_before_n: float | None = None
     """Vertical force of the hand."""
     com_before_max_mm: float | None = None
-    """Largest horizontal distance of the COM from the middle of the ankles."""
+    """Largest horizontal distance of the COM from midway between the ankles."""
     hold_ms: float | None = None
-    """From the kill to HOLD, slowest module; None if one held already."""
+    """Time from the kill to HOLD, slowest module; None if a module already held."""
     torque_step_nm: float | None = None
     """Largest step of a joint's torque at the hand-over."""
     foot_load_min_n: float | None = None
-    """Smallest normal force under either foot, after."""
+    """Smallest normal force under either foot after the kill."""
     com_x_min_mm: float | None = None
     com_x_max_mm: float | None = None
     com_y_min_mm: float | None = None
@@ -291,7 +291,7 @@ class _KillResult(Ended, frozen=True, kw_only=True):
     yaw_max_rad: float | None = None
     sole_tilt_max_rad: float | None = None
     slip_max_mm: float | None = None
-    """Largest distance of an ankle from its first place, mm."""
+    """Largest distance of an ankle from its initial position, mm."""
 
 
 def run_case(case: KillCase, robot: RobotConfig, observer: Observer = NOBODY) -> _KillResult:
@@ -377,11 +377,11 @@ def robots_of(
 ) -> list[RobotConfig]:
     """Return the robot with the payload of each case, and a gain schedule that fits.
 
-    A certified schedule depends on the payload and takes seconds: one for each, over processes.
+    A certified schedule depends on the payload and takes seconds, so processes compute them.
 
     Raises:
-        RunError: no local gains meet the certificate with a payload; says which.
-        MissingPackageError: a schedule is missing, and so is CVXPY.
+        RunError: no local gains meet the certificate with a payload; names it.
+        MissingPackageError: a schedule and CVXPY are missing.
     """
     weights = sorted({case.payload_kg for case in cases})
     ready = {weight: with_payload(robot, weight) for weight in weights}
@@ -422,7 +422,7 @@ FIGURES: Final = (
     ("hold_ms", "kill to HOLD", "ms", 1.0),
     ("operator_peak_before_n", "operator's force before the kill", "N", 1.0),
 )
-"""Column, words, unit, and the sign that is worse."""
+"""Column, description, unit, and the sign of the worse direction."""
 
 EXAMPLES: Final = """
 xrl study kill
@@ -433,14 +433,14 @@ xrl study kill --only 137 --seed 1 --out out/case137
 
 
 class KillStudyFlags(StudyFlags, LawFlags, PushFlags):
-    """How many, and which law."""
+    """Number of cases, and the law."""
 
     n: Count = 500
     """cases"""
 
 
 def describe(row: Row) -> str:
-    """Return a case in a line."""
+    """Return a case in one line."""
     words = [f"case {row['number']}: payload {row['payload_kg']:g} kg"]
     if row["kill_height_m"] is not None:
         words.append(
@@ -450,7 +450,7 @@ def describe(row: Row) -> str:
     if row["fell_at_s"] is not None:
         words.append(f"fell at {row['fell_at_s']:.2f} s")
     elif row["ending"] == Ending.FELL:
-        words.append("fell before the scenario began")
+        words.append("fell before the scenario started")
     words.append(f"delay {row['delay_ms']:g} ms")
     hand_off = row["let_go_s"]
     words.append("hand on" if hand_off is None else f"hand off at {hand_off:g} s")
@@ -465,7 +465,7 @@ def _pushes(row: Row) -> list[tuple[float, float, float]]:
 
 
 def draw(finished: StudyRun) -> Picture:
-    """Draw how far the COM went, by the direction of the strongest push."""
+    """Draw the largest distance of the COM by the direction of the strongest push."""
     rows = [row for row in finished.rows if row["com_max_mm"] is not None]
     standing, fallen = parted(rows)
     edge = 1.15 * max((row["com_max_mm"] for row in standing), default=100.0)

@@ -1,9 +1,9 @@
 """`xrl study latency`: three controls over networks from good to hopeless, under pushes.
 
-The fleet starts and is led over a good network; at a random time every link is impaired, both ways,
+The fleet starts and is led over a good network. At a random time every link is impaired, both ways,
 to the end. That time, the pushes and the lost messages are random. They are the same for every
-delay and control, and differ for each repeat, loss and jitter: a control's trials at one delay are
-independent.
+delay and control, but differ between repeats, losses and jitters, so a control's trials at one
+delay are independent.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ from tools.sim.centralised import CentralisedLockstep
 from tools.sim.lockstep import Lockstep
 
 SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
-"""s, and m below the stand: as in the paper's Fig. 7, at its pace."""
+"""Time, s, and depth below the stand, m, as in the paper's Fig. 7, at its pace."""
 DURATION_S: Final = 7.0
 IMPAIRED_FROM_S: Final = (0.1, 2.5)
-"""On the first way down; the robot that holds from then on holds there."""
+"""Range of start times, all on the first way down, s; a robot that holds then holds there."""
 PUSH_SHARE: Final = (0.2, SHARE)
 PUSH_S: Final = 0.3
 PUSHES: Final = 3
 PUSHED_UNTIL_S: Final = 5.3
-"""The pushes come over the bad network, one in each third of the time, at random."""
+"""The pushes come over the bad network, one in each third of the time, at random moments."""
 
 
 class _ControlKind(NamedTuple):
@@ -71,7 +71,7 @@ class _ControlKind(NamedTuple):
     about: str
     fleet: type[Lockstep]
     split: str | None
-    """`law.split`; None: as the robot file has it."""
+    """`law.split`; None for that of the robot file."""
     colour: str
     marker: str
 
@@ -85,22 +85,22 @@ CONTROLS: Final = {
         "the paper's local gains, diag(K_q)", Lockstep, "diagonal", "#c77700", "s"
     ),
     "centralised": _ControlKind(
-        "every torque by the planner, and nothing below it: gains not retuned for the delay, no "
-        "damping on the drives, the last torques kept when no new ones come, overload ignored",
+        "every torque by the planner, without a lower tier: gains not retuned for the delay, no "
+        "damping on the drives, the last torques kept while none arrive, overload ignored",
         CentralisedLockstep, None, "#7b3fa0", "^",
     ),
 }  # fmt: skip
-"""By name."""
+"""Controls by name."""
 
 
 class Network(msgspec.Struct, frozen=True):
-    """What every link does, each way, once it is bad. Datagrams: nothing waits."""
+    """Impairment of every link, each way. The links use datagrams, so no message waits."""
 
     delay_ms: float
     jitter_ms: float
-    """Uniform, +- so much."""
+    """Uniform, plus or minus this."""
     loss: float
-    """Share of the messages."""
+    """Fraction of the messages."""
 
 
 class Draw(NamedTuple):
@@ -108,14 +108,14 @@ class Draw(NamedTuple):
 
     impaired_from_s: float
     shoves: tuple[tuple[float, float, float], ...]
-    """Pushes: time, s; share of what soles and motors bear along their direction (`PushRange`);
-    angle, rad from x (forwards) to y (left)."""
+    """Pushes: time, s; fraction of what soles and motors withstand along their direction
+    (`PushRange`); angle, rad from x (forwards) to y (left)."""
     fleet_seed: int
     """Seed of losses, jitter and the harness sensor's noise."""
 
 
 class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
-    """A trial."""
+    """A trial of one control over one network."""
 
     number: int
     """Number of the row."""
@@ -126,7 +126,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def draw(self) -> Draw:
-        """Random draws, the same for every delay and control."""
+        """The random draws, equal for every delay and control."""
         jitter, loss = plain(self.network.jitter_ms), plain(self.network.loss)
         dice = random.Random(f"latency {self.seed} {self.repeat} {jitter} {loss}")
         begin = uniform(dice, *IMPAIRED_FROM_S)
@@ -153,25 +153,25 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def true_plant(self) -> PlantConfig:
-        """Return the simulated robot: all errors drawn, the same for each control."""
+        """Return the simulated robot, with random errors that are equal for each control."""
         return plants.draw(f"latency {self.draw.fleet_seed}")
 
 
 class _LatencyResult(Ended, frozen=True, kw_only=True):
-    """The figures of a trial, over the bad network, to the end or the fall."""
+    """The figures of a trial over the bad network, to the end or the fall."""
 
     operator_peak_n: float | None = None
     """Vertical force of the hand."""
     operator_rms_n: float | None = None
     com_max_mm: float | None = None
-    """Largest horizontal distance of the COM from the middle of the ankles."""
+    """Largest horizontal distance of the COM from midway between the ankles."""
     hold_share: float | None = None
-    """Fraction of the time in which a module held, so that the robot did not follow the hand.
+    """Fraction of the time in which a module held, so the robot did not follow the hand.
 
     Always 0 for the centralised control, which has no HOLD.
     """
     holds: int | None = None
-    """Changes from TRACK to HOLD of the busiest module."""
+    """Changes from TRACK to HOLD of the module with the most."""
     torque_step_nm: float | None = None
     """Largest change of a joint's torque from one state to the next (4 ms)."""
     hold_step_nm: float | None = None
@@ -180,7 +180,7 @@ class _LatencyResult(Ended, frozen=True, kw_only=True):
 
 
 def row_of(trial: LatencyTrial) -> dict[str, object]:
-    """Return a trial by column; the network as its flags have it, to the last digit."""
+    """Return a trial by column; the network as in its flags, to the last digit."""
     network = msgspec.structs.asdict(trial.network)
     return {
         "number": trial.number,
@@ -245,7 +245,7 @@ def _torque_step_nm(run: CaseRun, from_ns: int) -> float:
 
 
 def hold_share(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> float:
-    """Return the share of a time in which a module held, by all changes since the start."""
+    """Return the fraction of a time in which a module held; `events` start with the run."""
     if to_ns <= from_ns:
         return 0.0
     holding: set[str] = set()
@@ -270,7 +270,7 @@ DELAY_MAX_MS: Final = 60_000.0
 
 
 def values_up_to(high: float) -> Callable[[str], tuple[float, ...]]:
-    """Return a reader for argparse: `0,10,50` as numbers, rising, none twice."""
+    """Return a parser for argparse: `0,10,50` as ascending numbers without repeats."""
 
     def read(text: str) -> tuple[float, ...]:
         try:
@@ -279,7 +279,7 @@ def values_up_to(high: float) -> Callable[[str], tuple[float, ...]]:
             found = {math.nan}
         if not all(0.0 <= value <= high for value in found):
             raise argparse.ArgumentTypeError(
-                f"{text!r}: write numbers from 0 to {high:g} with commas, such as 0,0.5"
+                f"{text!r}: must be numbers from 0 to {high:g} with commas, such as 0,0.5"
             )
         return tuple(sorted(found))
 
@@ -299,7 +299,7 @@ xrl study latency --cluster tcp://HOST:8786
 
 
 class LatencyStudyFlags(StudyFlags):
-    """Which networks and controls."""
+    """Networks and controls to compare."""
 
     delay: Annotated[
         tuple[float, ...],
@@ -315,23 +315,23 @@ class LatencyStudyFlags(StudyFlags):
         tuple[float, ...],
         parsed(
             _SHARES, "P", is_one=True,
-            help="share of the messages that is lost; several as for --delay "
+            help="fraction of the messages that is lost; several as for --delay "
             f"(default: {LOSSES})",
         ),
     ] = _SHARES(LOSSES)  # fmt: skip
     n: Count = 4
-    """trials of each network"""
+    """trials per network"""
     control: Annotated[
         tuple[str, ...],
         parsed(
             names_of(CONTROLS), "NAME,...", is_one=True,
-            help="which to compare (default: all): "
+            help="controls to compare (default: all): "
             + "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items()),
         ),
     ] = tuple(CONTROLS)  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a comparison of nothing."""
+        """Refuse an empty comparison."""
         super().check()
         if not self.control:
             raise RunError(f"--control: name at least one of {', '.join(CONTROLS)}")
@@ -344,10 +344,10 @@ def grid_of(flags: LatencyStudyFlags) -> list[tuple[Network, str]]:
 
 
 def trial_of(grid: Sequence[tuple[Network, str]], seed: int, number: int) -> LatencyTrial:
-    """Return the trial of a number.
+    """Return the trial with a number.
 
-    The whole grid comes once, then again: an interrupted study has trials of each network, and a
-    resumed one may have more trials.
+    The numbers run through the whole grid, then again. So an interrupted study has trials of each
+    network, and a resumed study may have more trials.
     """
     repeat, place = divmod(number, len(grid))
     network, control = grid[place]
@@ -366,7 +366,7 @@ class _Cell(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The cell of the table; the bounds are those of the share of falls in this mix."""
+        """The cell of the table; the bounds are for the fraction of falls in this mix."""
         low, high = wilson(self.fallen, self.of)
         bounds = f"{100 * low:.0f}-{100 * high:.0f} %"
         return (
@@ -392,7 +392,7 @@ def cells_of(rows: Sequence[Row]) -> dict[tuple[str, float], _Cell]:
 
 
 def mix(rows: Sequence[Row]) -> str:
-    """Return the networks that the trials at one delay mix, as text."""
+    """Return the networks that are mixed at each delay, as text."""
     losses = sorted({float(row["loss"]) for row in rows})
     jitters = sorted({float(row["jitter_ms"]) for row in rows})
     words = ", ".join(f"{100 * loss:g}" for loss in losses) + " % lost"
@@ -400,11 +400,11 @@ def mix(rows: Sequence[Row]) -> str:
 
 
 def report(finished: StudyRun) -> None:
-    """Print falls, hand and HOLD by delay, and how to see the first fall of each control."""
+    """Print falls, hand and HOLD by delay, and the command for each control's first fall."""
     rows, console = finished.rows, finished.console
     cells = cells_of(rows)
     names = list(dict.fromkeys(control for control, _ in cells))
-    title = f"Falls, 95 % of their share (Wilson), hand's peak, time in HOLD; mix: {mix(rows)}"
+    title = f"Falls with 95 % interval (Wilson), hand's peak, time in HOLD; mix: {mix(rows)}"
     printed = Table(title=title, title_justify="left")
     for heading in ("delay ms", *names):
         printed.add_column(heading, justify="right")
@@ -422,7 +422,7 @@ def report(finished: StudyRun) -> None:
 
 
 def draw(finished: StudyRun) -> Picture:
-    """Draw the share of falls, and the hand's force, by delay."""
+    """Draw the fraction of falls and the hand's force by delay."""
     rows = finished.rows
     cells = cells_of(rows)
     figure = new_figure(8, 8)
@@ -446,7 +446,7 @@ def draw(finished: StudyRun) -> Picture:
         axis.grid(visible=True, lw=0.3)
     figure.suptitle(
         f"{len(rows)} runs of {DURATION_S:g} s, seed {finished.flags.seed}: squats led by hand, "
-        f"{PUSHES} pushes of up to\n{SHARE:.0%} of what soles and motors bear; {mix(rows)}",
+        f"{PUSHES} pushes of up to\n{SHARE:.0%} of what soles and motors withstand; {mix(rows)}",
         fontsize=10, x=0.01, ha="left",
     )  # fmt: skip
     return figure

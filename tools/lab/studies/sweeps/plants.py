@@ -1,4 +1,4 @@
-"""What the studies draw: plants, with every error of `deploy/plants/ranges.toml`, and pushes."""
+"""Random draws of the studies: plants with errors from `deploy/plants/ranges.toml`, and pushes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tools.lab.design.push_limit import LoadedStand, stand_at
 
 RANGES_FILE: Final = FILES / "plants" / "ranges.toml"
 LEAST_SHARE: Final = 0.5
-"""Fraction of a range's low end below which a wider draw does not go."""
+"""Fraction of a range's low end that a wider draw does not go below."""
 DIGITS: Final = 3
 REACHED_M: Final = 1e-4
 SHARE: Final = 0.75
@@ -33,7 +33,7 @@ class _ErrorRange(Section, frozen=True):
     """One error of the plant."""
 
     key: str
-    """Key of the plant, such as `drivetrain.play`; every number below it is drawn by itself."""
+    """Key of the plant, such as `drivetrain.play`; each of its numbers is drawn separately."""
     low: float
     high: float
     scale: Literal["linear", "log"] = "linear"
@@ -50,7 +50,7 @@ def shipped() -> _Ranges:
     """Return the ranges of this checkout.
 
     Raises:
-        ConfigError: a range makes no sense.
+        ConfigError: a range is invalid.
     """
     ranges = read_toml(RANGES_FILE, _Ranges)
     for row in ranges.error:
@@ -61,10 +61,10 @@ def shipped() -> _Ranges:
 
 
 def draw(seed: str, beyond: float = 1.0) -> PlantConfig:
-    """Return a plant: the same text draws the same one; `beyond` widens the ranges.
+    """Return a plant that is determined by a text; `beyond` widens the ranges.
 
     Raises:
-        ConfigError: a key is none of the plant's, or a drawn value is impossible.
+        ConfigError: a key does not exist in the plant, or a drawn value is impossible.
     """
     dice = random.Random(f"plant {seed}")
     table = msgspec.to_builtins(PlantConfig())
@@ -80,7 +80,7 @@ def draw(seed: str, beyond: float = 1.0) -> PlantConfig:
 
 
 def errors_of(plant: PlantConfig) -> dict[str, float]:
-    """Return each drawn error as one number: its value, or the largest of several, absolute."""
+    """Return each drawn error as one number: its value, or the largest absolute of several."""
     table = msgspec.to_builtins(plant)
     found = {}
     for row in shipped().error:
@@ -97,21 +97,21 @@ def _drawn(dice: random.Random, row: _ErrorRange, beyond: float) -> float:
     middle, half = 0.5 * (low + high), 0.5 * (high - low) * beyond
     value = dice.uniform(middle - half, middle + half)
     value = math.exp(value) if logarithmic else value
-    if row.low >= 0.0:  # what cannot be negative, or nothing, comes no nearer to it than this
+    if row.low >= 0.0:  # keeps a wider draw positive
         value = max(LEAST_SHARE * row.low, value)
     return float(f"{value:.6g}")
 
 
 class PushRange:
-    """The hardest push that a standing robot bears for ever, by direction.
+    """The largest constant push that a standing robot withstands, by direction.
 
-    It is the physical limit (`LoadedStand.limit_of_body`), whatever the control. Forwards and back
-    it is least in the stand; sideways squat and crawl differ from it by less than a quarter.
-    The shipped robot's: 76 to 158 N.
+    It is the physical limit (`LoadedStand.limit_of_body`) under any control. Forwards and back it
+    is smallest in the stand; sideways it differs from squat and crawl by less than a quarter. For
+    the shipped robot it is 76 to 158 N.
     """
 
     def __init__(self, robot: RobotConfig, most: float = SHARE) -> None:
-        """Stand the robot of a file on a level floor; `draw` goes up to `most` of the limit."""
+        """Compute the stand of a robot on a level floor; `draw` goes up to `most` of the limit."""
         self._most = most
         self._stand, _ = torso_at(robot, robot.simulation.stand_height, 0.0)
 
@@ -120,7 +120,7 @@ class PushRange:
         return self._stand.limit_of_body((math.cos(angle), math.sin(angle))).force_n
 
     def push(self, at: float, duration: float, share: float, angle: float) -> Push:
-        """Return a push of a share of the limit along an angle as for `limit_n`."""
+        """Return a push with a fraction of the limit, along an angle as for `limit_n`."""
         force = share * self.limit_n(angle)
         x, y = (round(force * axis, DIGITS) for axis in (math.cos(angle), math.sin(angle)))
         return Push(at=round(at, DIGITS), duration=duration, force=(x, y, 0.0))
@@ -128,40 +128,40 @@ class PushRange:
     def draw(
         self, dice: random.Random, shares: tuple[float, float], at: float, duration: float
     ) -> Push:
-        """Return a push in any direction, of a share between the two of the hardest drawn."""
+        """Return a push in a random direction, with a random fraction of the largest one drawn."""
         share, angle = self._most * dice.uniform(*shares), dice.uniform(-math.pi, math.pi)
         return self.push(at, duration, share, angle)
 
 
 def uniform(dice: random.Random, low: float, high: float) -> float:
-    """Return a number that a table holds exactly as it was drawn."""
+    """Return a random number, rounded so that a table stores it exactly."""
     return round(dice.uniform(low, high), DIGITS)
 
 
 class PushFlags(Flags):
-    """How hard a study pushes."""
+    """Strength of a study's pushes."""
 
     push: Annotated[
         float,
         Range(1e-3, SHARE_MAX, ""),
         Arg(
             metavar="SHARE",
-            help="push up to this share of what soles and motors bear, standing, in each "
-            "direction: 1 is 76 N forwards and 158 N sideways of the shipped robot",
+            help="largest push, as a fraction of what soles and motors withstand in the stand, in "
+            "each direction: 1 is 76 N forwards and 158 N sideways for the shipped robot",
         ),
     ] = SHARE
 
 
 def describe(flags: PushFlags) -> str:
-    """Return how hard a study pushes, for its picture."""
-    return f"pushed with up to {flags.push:.0%} of what soles and motors bear"
+    """Return the strength of a study's pushes, for its picture."""
+    return f"pushed with up to {flags.push:.0%} of what soles and motors withstand"
 
 
 def torso_at(robot: RobotConfig, torso: float, pitch: float) -> tuple[LoadedStand, float]:
     """Return the stand with the torso's origin at a height, m, and its COM height, by bisection.
 
     Raises:
-        RunError: the robot does not reach it.
+        RunError: the robot does not reach that stand.
     """
     poses = Poses(robot)
     low, high = poses.reach()
@@ -175,5 +175,5 @@ def torso_at(robot: RobotConfig, torso: float, pitch: float) -> tuple[LoadedStan
     stand = stand_at(robot, poses, low, pitch)
     if stand is None:
         where = f"the torso at {torso:g} m, pitch {pitch:g} rad"
-        raise RunError(f"a stand with {where}: this robot does not reach it")
+        raise RunError(f"a stand with {where} is out of this robot's reach")
     return stand, low

@@ -1,8 +1,8 @@
-"""Work spread by joblib over processes of this machine, or over the workers of a Dask cluster.
+"""Runs work with joblib in processes of this machine, or on the workers of a Dask cluster.
 
-A cluster with a single worker is not used: joblib then runs the cases here. No process is left
-behind: a worker leaves Ctrl-C to the process that started it, and ends when that
-process does. A cluster's workers run this project's own code, so each compares it with the study's.
+With a single worker in the cluster, joblib runs the cases here instead. No process is left behind:
+a worker ignores Ctrl-C, and ends when the process that started it ends. A cluster's workers run
+their own copy of this project's code, so each compares it with the study's.
 """
 
 from __future__ import annotations
@@ -36,26 +36,26 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 CONNECT_S: Final = 10.0
-"""Timeout for the scheduler's first answer."""
+"""Timeout for the scheduler's first answer, s."""
 WORKERS_S: Final = 60
-"""Timeout for the first worker of a cluster."""
+"""Timeout for the first worker of a cluster, s."""
 CODE: Final = ("services", "shared", "tools/lab", "tools/sim")
-"""Folders whose code decides how a case comes out."""
+"""Folders whose code affects the outcome of a case."""
 
 _one_at_a_time: Final = Lock()
-"""A worker with several threads runs one case after the other: CasADi builds its graphs in one
+"""Makes a worker with several threads run one case at a time: CasADi builds its graphs in one
 thread only."""
 
 
 def cores() -> int:
-    """Return the number of worker processes to use: one a core, or one without joblib."""
+    """Return the number of worker processes to use: one per core, or one without joblib."""
     count = len(os.sched_getaffinity(0))
     return min(count, 1) if importlib.util.find_spec("joblib") is None else count
 
 
 @cache
 def code_digest() -> str:
-    """Return the SHA-256 of the code that decides how a case comes out."""
+    """Return the SHA-256 of the code that affects the outcome of a case."""
     digest = hashlib.sha256()
     for folder in CODE:
         for path in sorted((CHECKOUT / folder).rglob("*.py")):
@@ -70,29 +70,29 @@ def results(
     name: Callable[[T], str],
     cluster: str | None = None,
 ) -> Iterator[tuple[T, R]]:
-    """Yield each task with its result as it is done, in no order.
+    """Yield each task with its result when it is done, in any order.
 
     Leaving the loop early, by an exception or by `close`, ends the rest at once. `work` is a
-    function of a module, `name` returns a task's name for an error. One worker is this process.
-    With the address of a Dask scheduler its workers run the tasks.
+    module-level function. `name` returns a task's name for an error. With one worker the tasks run
+    in this process. With the address of a Dask scheduler its workers run them.
 
     Raises:
         RunError: no worker can be started or reached, the work failed on a task, a worker died, or
-            a cluster's worker has other code.
+            a cluster's worker has different code.
     """
     digest = "" if cluster is None else code_digest()
     calls = [(work, digest, number, task, name(task)) for number, task in enumerate(tasks)]
     if workers == 1 and cluster is None:
         yield from ((task, _run(*call)[1]) for task, call in zip(tasks, calls, strict=True))
         return
-    lost = "a worker process was killed (out of memory?); it may need fewer --workers"
+    lost = "a worker process was killed (out of memory?); try fewer --workers"
     if cluster is not None:
         lost = f"--cluster {cluster}: connection to the scheduler lost"
     with _processes(workers) if cluster is None else _cluster(cluster):
         parallel = joblib.Parallel(n_jobs=-1 if cluster else min(workers, len(tasks)),
                                    batch_size=1, return_as="generator_unordered")  # fmt: skip
         try:
-            warnings.filterwarnings("ignore", module="joblib")  # that cancelled tasks are lost
+            warnings.filterwarnings("ignore", module="joblib")  # about lost, cancelled tasks
             with closing(parallel(joblib.delayed(_run)(*call) for call in calls)) as outputs:
                 for number, result in outputs:
                     yield tasks[number], result
@@ -106,9 +106,9 @@ def results(
 
 
 def _run(work: Callable[[T], R], digest: str, number: int, task: T, name: str) -> tuple[int, R]:
-    """Do the work in a worker; `digest` is that of the study's code, if the code may differ."""
+    """Do the work in a worker; `digest` is that of the study's code, or empty if it is the same."""
     if digest not in ("", code_digest()):
-        raise RunError(f"{name}: a worker of the cluster has other code; install the same")
+        raise RunError(f"{name}: a worker of the cluster has different code; install the same code")
     try:
         with _one_at_a_time:
             return number, work(task)
@@ -127,7 +127,7 @@ def _processes(workers: int) -> Iterator[None]:
             yield
     except OSError as error:  # loky's locks are files in shared memory
         words = os_error_in_words(error)
-        raise RunError(f"no worker process can be started: {words}; is /dev/shm there?") from None
+        raise RunError(f"cannot start worker processes: {words}; does /dev/shm exist?") from None
     finally:
         loky.get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
@@ -140,19 +140,19 @@ def _begin(parent: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent ends, whatever ended the parent."""
-    with suppress(ProcessLookupError):  # it has ended already
+    """End this process when its parent ends for any reason."""
+    with suppress(ProcessLookupError):  # the parent has already ended
         select.select([os.pidfd_open(parent)], [], [])
     os._exit(FAULT_EXIT_CODE)
 
 
 @contextmanager
 def _cluster(address: str) -> Iterator[None]:
-    """Run tasks on a Dask cluster; Dask's own log lines stay silent, errors are raised here."""
+    """Run tasks on a Dask cluster; Dask's log lines are suppressed, errors are raised here."""
     scheme, _, place = address.partition("://")
     if scheme not in ("tcp", "tls") or ":" not in place:
-        raise RunError(f"--cluster {address}: write tcp://HOST:PORT of a Dask scheduler")
-    require("cluster", "leave --cluster")
+        raise RunError(f"--cluster {address}: must be tcp://HOST:PORT of a Dask scheduler")
+    require("cluster", "remove --cluster")
     dask = importlib.import_module("distributed")
     logging.disable(logging.CRITICAL)
     try:
@@ -164,7 +164,7 @@ def _cluster(address: str) -> Iterator[None]:
             client.close()
     except (OSError, TimeoutError):
         raise RunError(
-            f"--cluster {address}: no Dask scheduler answers there; start one with "
+            f"--cluster {address}: no Dask scheduler answers at this address; start one with "
             "`dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`"
         ) from None
     finally:

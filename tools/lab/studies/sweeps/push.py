@@ -1,7 +1,7 @@
-"""`xrl study push`: the hardest push by direction, duration, pose and mode, found by bisection.
+"""`xrl study push`: the largest withstood push by direction, duration, pose and mode, by bisection.
 
-The robot is stood up, led to the pose and, if the planner is to be dead, left by it. Each push
-begins from that same moment.
+The robot stands up and is led to the pose. For the mode `dead` the planner is then killed. Each
+push begins from that same moment.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from tools.sim.network import BASE
 POSES: Final = {"stand": (1.188, 0.0), "squat": (0.95, 0.0), "crawl": (0.79, 1.2)}
 """Torso height, m, and pitch, rad."""
 MODES: Final = ("led", "dead")
-"""While the planner leads, and with the planner dead."""
+"""The planner leads, or is dead."""
 REACHED_S: Final = 2.5
 """Scenario time at which the pose is reached."""
 LEFT_S: Final = 3.5
@@ -42,7 +42,7 @@ LEFT_S: Final = 3.5
 BEGIN_S: Final = 4.5
 """Scenario time at which the push begins."""
 REST_S: Final = 2.0
-"""So long after the push a robot that is to fall has fallen, or is tipping."""
+"""Time after the push within which a robot that will fall has fallen, or is tipping, s."""
 FORCE_MAX_N: Final = 240.0
 STEP_N: Final = 5.0
 
@@ -59,7 +59,7 @@ class PushTrial(msgspec.Struct, frozen=True):
     plant: PlantConfig = PlantConfig()
 
     def scenario(self, _robot: RobotConfig, force_n: float = 0.0) -> Scenario:
-        """Return what happens for a push of this force."""
+        """Return the scenario with a push of this force."""
         height, pitch = POSES[self.pose]
         angle = math.radians(self.angle_deg)
         push = Push(
@@ -85,26 +85,26 @@ class PushTrial(msgspec.Struct, frozen=True):
 
 
 class _PushResult(msgspec.Struct, frozen=True, kw_only=True):
-    """How hard a push is stood."""
+    """The withstood push and the static limits."""
 
     stood_n: float
-    """The hardest that it stood, N; 0 if none."""
+    """Largest push that the robot withstood, N; 0 if none."""
     fell_n: float | None
-    """The lightest that it fell at, within `STEP_N` of it; None: it stood them all."""
+    """Smallest push that made it fall, within `STEP_N`, N; None if it withstood all of them."""
     held_limit_n: float
-    """What its gains bear if the push lasts (`tools.lab.design.push_limit`): HOLD's, into which a
-    led robot trips but for a push straight forwards or back."""
+    """Static limit of its gains (`tools.lab.design.push_limit`): those of HOLD, because a led robot
+    trips into it unless the push is straight forwards or back."""
     held_part: str
-    """What gives way then."""
+    """The part that sets this limit."""
     body_limit_n: float
-    """What soles and motors bear in this pose if the push lasts, whatever the control."""
+    """Static limit of soles and motors in this pose, under any control."""
 
 
 def run_trial(trial: PushTrial, robot: RobotConfig, _observer: Observer = NOBODY) -> _PushResult:
-    """Find the hardest push by bisection.
+    """Find the largest withstood push by bisection.
 
     Raises:
-        RunError: the robot does not come to the pose.
+        RunError: the robot does not reach the pose.
     """
     start = _start_of(trial, robot)
     stood, fell = 0.0, FORCE_MAX_N + STEP_N
@@ -146,7 +146,7 @@ def _start_of(trial: PushTrial, robot: RobotConfig) -> FleetMoment:
         if truth.scenario_s >= BEGIN_S - 0.1:
             break
     if fleet.world.scenario_s < BEGIN_S - 0.1:
-        raise RunError(f"{trial.pose}: the six modules never came to track")
+        raise RunError(f"{trial.pose}: the six modules did not track")
     moment = fleet.moment()
     return moment if trial.mode == "led" else msgspec.structs.replace(moment, planner=None)
 
@@ -160,18 +160,18 @@ def _stands(trial: PushTrial, robot: RobotConfig, start: FleetMoment, force_n: f
 
 
 ANGLES_DEG: Final = (0, 45, 90, 135, 180)
-"""Left and right are alike."""
+"""Left and right are symmetric."""
 SIDES_DEG: Final = ("0", "45", "90", "135", "180", "-135", "-90", "-45")
-"""Degrees of a push to the right."""
+"""Labels of the directions, with negative degrees to the right."""
 DURATIONS_S: Final = (0.3, 3.0)
 SHORT: Final = {"led": "leads", "dead": "dead"}
 CURVES: Final = (
     ("led", "stood_n", "#1f5f8b", "-o", "planner leads"),
     ("dead", "stood_n", FALL_COLOUR, "-o", "planner dead"),
-    ("dead", "held_limit_n", FALL_COLOUR, "--", "gains of HOLD, push lasting"),
-    ("dead", "body_limit_n", "black", "--", "soles and motors, push lasting"),
+    ("dead", "held_limit_n", FALL_COLOUR, "--", "gains of HOLD, constant push"),
+    ("dead", "body_limit_n", "black", "--", "soles and motors, constant push"),
 )
-"""Mode, column, colour, line, in words."""
+"""Mode, column, colour, line, label."""
 
 
 EXAMPLES: Final = """
@@ -182,20 +182,20 @@ xrl study push --plant drivetrain.stiffness=2000 --out out/soft
 
 
 class PushStudyFlags(StudyFlags, PlantFlags):
-    """Which points."""
+    """Points to measure."""
 
     pose: Annotated[tuple[str, ...], Arg(choices=tuple(POSES))] = ()
-    """only this one; may be repeated"""
+    """only this pose; may be repeated"""
     angle: Annotated[tuple[Degrees, ...], Arg(metavar="DEG")] = ()
     """push that way, 0 forwards, 90 to the left; may be repeated (0, 45, 90, 135, 180)"""
     duration: tuple[Duration, ...] = ()
-    """of the pushes; may be repeated (0.3, 3)"""
+    """duration of the pushes; may be repeated (0.3, 3)"""
 
     def check(self) -> None:
-        """Refuse a log of one point, which is many runs."""
+        """Refuse --out for a single point, which is many runs and has no log."""
         super().check()
         if self.only is not None and self.out is not None:
-            raise RunError("--only: a point is many runs and has no log; leave --out")
+            raise RunError("--only: a point is many runs and has no log; remove --out")
 
 
 def trials_of(flags: PushStudyFlags) -> list[PushTrial]:
@@ -217,10 +217,10 @@ def row_of(trial: PushTrial) -> dict[str, object]:
 
 
 def report(finished: StudyRun) -> None:
-    """Print the hardest pushes by direction, and what gives way in the weakest."""
+    """Print the largest withstood pushes by direction, and the part that gives way first."""
     rows = finished.rows
     angles = [f"{angle} deg" for angle in dict.fromkeys(row["angle_deg"] for row in rows)]
-    printed = Table(title="Hardest push that it stood, N", title_justify="left")
+    printed = Table(title="Largest push that it withstood, N", title_justify="left")
     for heading in ("pose", "s", "planner", *angles, "gives way"):
         printed.add_column(heading, no_wrap=True)
     groups: dict[tuple[str, float, str], list[Row]] = {}
@@ -234,7 +234,7 @@ def report(finished: StudyRun) -> None:
 
 
 def draw(finished: StudyRun) -> Picture:
-    """Draw the envelopes: a panel for each pose and duration, forwards is up."""
+    """Draw the envelopes, with a panel for each pose and duration; forwards is up."""
     rows = finished.rows
     poses = list(dict.fromkeys(row["pose"] for row in rows))
     durations = list(dict.fromkeys(row["duration_s"] for row in rows))
@@ -252,7 +252,7 @@ def draw(finished: StudyRun) -> Picture:
         axis.set_thetagrids(range(0, 360, 45), SIDES_DEG)
         axis.set_title(f"{pose}, {duration:g} s, N")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    figure.suptitle("Hardest push that it stood, by direction (up: forwards)", x=0.01, ha="left")
+    figure.suptitle("Largest withstood push, by direction (up: forwards)", x=0.01, ha="left")
     return figure
 
 

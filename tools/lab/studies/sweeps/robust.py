@@ -1,6 +1,6 @@
-"""`xrl study robust`: every error of the plant drawn at once, led, pushed and killed: who falls.
+"""`xrl study robust`: draws every error of the plant at once, leads, pushes, kills, counts falls.
 
-A trial follows from the seed and its number alone.
+The seed and the number of a trial determine it.
 """
 
 from __future__ import annotations
@@ -51,31 +51,31 @@ else:
 KINDS: Final = ("squat", "crawl", "lean")
 DELAY_MAX_MS: Final = 10.0
 LEAD_S: Final = 2.0
-"""Each way of a squat; the crawl takes twice that."""
+"""Duration of each way of a squat, s; the crawl takes twice that."""
 LEAN_SHARE: Final = (0.15, 0.4)
 LEAN_S: Final = 1.5
-"""A push that lasts, while the planner leads."""
+"""Duration of the long push while the planner leads, s."""
 PUSH_SHARE: Final = (0.3, 1.0)
-"""Shares of the hardest push that is drawn (`PushRange`)."""
+"""Fractions of the largest drawn push (`PushRange`)."""
 PUSH_S: Final = 0.3
 AFTER_KILL_S: Final = 2.5
 
 
 class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
-    """A trial; the plant follows from seed, number and `beyond`."""
+    """A trial; seed, number and `beyond` determine the plant."""
 
     number: int
     seed: int
     beyond: float
-    """Times the ranges of `deploy/plants/ranges.toml`."""
+    """Factor on the ranges of `deploy/plants/ranges.toml`."""
     slope_deg: float
-    """The floor's slope, in a direction that is drawn; 0: as the ranges have it."""
+    """The floor's slope, in a random direction; 0 for a slope from the ranges."""
     kind: str
     kill_s: float
     delay_ms: float
     pushes: tuple[Push, ...]
     reacts_s: float | None = None
-    """Time in which the person stops leading once the robot holds; None: they lead on."""
+    """Time from HOLD until the person stops leading; None if they keep leading."""
 
     def true_plant(self) -> PlantConfig:
         """Return the trial's simulated robot."""
@@ -89,7 +89,7 @@ class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
         return changed(plant, {"floor.slope": towards})
 
     def scenario(self, robot: RobotConfig) -> Scenario:
-        """Return what happens."""
+        """Return the trial as a scenario."""
         stand = robot.simulation.stand_height
         ways = {
             "crawl": (Keyframe(2.0 * LEAD_S, 0.79, pitch=1.2, assist=robot.assist.force_max),),
@@ -107,12 +107,12 @@ class RobustTrial(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _RobustResult(Ended, frozen=True, kw_only=True):
-    """The figures of a trial; None where there is nothing to measure."""
+    """The figures of a trial; None where nothing was measured."""
 
     operator_peak_n: float | None = None
     """Vertical force of the hand while the planner leads."""
     com_led_max_mm: float | None = None
-    """Largest horizontal distance of the COM from the middle of the ankles, led."""
+    """Largest horizontal distance of the COM from midway between the ankles, led."""
     com_held_max_mm: float | None = None
     """The same after the kill."""
     sole_tilt_max_rad: float | None = None
@@ -128,7 +128,7 @@ def draw(
     slope_deg: float = 0.0,
     reacts_s: float | None = None,
 ) -> RobustTrial:
-    """Return one trial; no other trial has to be drawn for it."""
+    """Return one trial, which does not depend on any other trial."""
     dice = random.Random(f"robust {seed} {number}")
     kind = KINDS[number % len(KINDS)]
     way = 2.0 * LEAD_S
@@ -170,7 +170,7 @@ def run_trial(trial: RobustTrial, robot: RobotConfig, observer: Observer = NOBOD
 
 
 def row_of(trial: RobustTrial) -> dict[str, object]:
-    """Return every draw by its column: the trial's, then the plant's errors."""
+    """Return every draw by its column: first the trial's, then the plant's errors."""
     row = scalars(trial)
     for name, push in zip(("led", "held"), trial.pushes, strict=True):
         row |= {f"push_{name}_x_n": push.force[0], f"push_{name}_y_n": push.force[1]}
@@ -179,7 +179,7 @@ def row_of(trial: RobustTrial) -> dict[str, object]:
 
 SLOPE_MAX_DEG: Final = 15.0
 RANKED_LEAST: Final = 30
-"""Trials from which errors are ranked: among fewer a correlation of 0.36 is chance."""
+"""Minimum number of trials for ranking errors: with fewer a correlation of 0.36 may be chance."""
 FIGURES: Final = (
     ("operator_peak_n", "operator's force, led", "N", 1.0),
     ("com_led_max_mm", "COM, led", "mm", 1.0),
@@ -187,7 +187,7 @@ FIGURES: Final = (
     ("sole_tilt_max_rad", "tilt of a sole", "rad", 1.0),
     ("hold_step_nm", "torque step into or out of HOLD", "N m", 1.0),
 )
-"""Column, words, unit, and the sign that is worse."""
+"""Column, description, unit, and the sign of the worse direction."""
 
 EXAMPLES: Final = """
 xrl study robust
@@ -200,21 +200,21 @@ xrl study robust --only 17 --out out/trial17
 
 
 class RobustStudyFlags(StudyFlags, ImuFlags, PushFlags):
-    """How many, and how far from the file."""
+    """Number of trials, and their distance from the file."""
 
     n: Count = 100
     """trials"""
     beyond: Annotated[Number, Arg(metavar="F")] = 1.0
-    """widen every range of deploy/plants/ranges.toml F times about its middle"""
+    """widen every range of deploy/plants/ranges.toml about its middle by the factor F"""
     slope: Annotated[float, Range(0.0, SLOPE_MAX_DEG, "degrees"), Arg(metavar="DEG")] = 0.0
-    """a floor that slopes by DEG degrees in a drawn direction (default: up to 1 degree, as in the
-    ranges)"""
+    """use a floor that slopes by DEG degrees in a random direction (default: up to 1 degree, as in
+    the ranges)"""
     reacts: Annotated[float | None, Range(0.0, 5.0, "s"), Arg(metavar="S")] = None
-    """the person stops leading S seconds after the robot went to HOLD, as told by `xrl cue`
-    (default: the hand leads on)"""
+    """the person stops leading S seconds after the robot went to HOLD, as warned by `xrl cue`
+    (default: the hand keeps leading)"""
 
     def check(self) -> None:
-        """Refuse ranges that cannot be drawn from."""
+        """Refuse ranges that give impossible values."""
         super().check()
         plants.draw("check", beyond=self.beyond)
 
@@ -222,7 +222,7 @@ class RobustStudyFlags(StudyFlags, ImuFlags, PushFlags):
 def ranking(rows: Sequence[Row]) -> list[tuple[str, float]]:
     """Return each error with its rank correlation with the COM's excursion, strongest first.
 
-    Of errors that go both ways the size counts; a trial that fell counts as the farthest.
+    For errors with both signs the size counts; a trial that fell counts as the farthest.
     """
     far = np.array([_excursion(row) for row in rows])
     found = []
@@ -241,14 +241,14 @@ def _excursion(row: Row) -> float:
 
 
 def report(finished: StudyRun) -> None:
-    """Print what came of the study, and which error takes most of the margin."""
+    """Print the outcome of the study, and the errors that cost most of the margin."""
     rows = finished.rows
     study.show_outcome(finished, FIGURES, lambda row: f"{row['kind']}: trial {row['number']}")
     if len(rows) < RANKED_LEAST:
-        most = f"{len(rows)} trials are too few to tell; from {RANKED_LEAST} on they are ranked"
+        most = f"{len(rows)} trials are too few to rank errors; needs at least {RANKED_LEAST}"
     else:
         most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
-    finished.console.print(f"takes most of the margin (rank correlation): {most}", soft_wrap=True)
+    finished.console.print(f"costs most of the margin (rank correlation): {most}", soft_wrap=True)
 
 
 def draw_excursions(finished: StudyRun) -> Picture:
@@ -262,7 +262,7 @@ def draw_excursions(finished: StudyRun) -> Picture:
         y = [min(200.0, _excursion(row)) for row in some]
         axis.scatter(x, y, marker=marker, color=colour, s=18, label=label)
     axis.set(xscale="log", xlabel="drivetrain stiffness, N m/rad")
-    axis.set_ylabel("COM from the middle of the ankles while led, mm (fell: 200)")
+    axis.set_ylabel("COM from midway between the ankles while led, mm (fell: 200)")
     axis.legend()
     title = f"{len(rows)} trials, every error drawn, ranges x{flags.beyond:g}, seed {flags.seed},\n"
     title += f"{plants.describe(flags)}: {len(parted(rows)[1])} fell"

@@ -1,6 +1,6 @@
-"""The one runner of all studies, on this machine or on a cluster.
+"""The runner that all studies share, on this machine or on a cluster.
 
-It draws the cases, runs those that the table lacks, writes each row as it is done, and reports.
+It draws the cases, runs those that the table lacks, writes each row when it is done, and reports.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from tools.terminal import Console, marked
 FALLS_SHOWN: Final = 10
 FALL_COLOUR: Final = "#c0392b"
 NOT_THE_STUDY: Final = ("n", "config", "seed", "only", "workers", "cluster", "out")
-"""Flags that `command_of` leaves out, or writes apart."""
+"""Flags that `command_of` leaves out or writes separately."""
 
 
 C = TypeVar("C", bound=Case)
@@ -55,9 +55,9 @@ class StudyFlags(ConfigFlags):
     """Flags of all studies."""
 
     seed: Natural = 1
-    """of the cases"""
+    """seed of the cases"""
     workers: Annotated[Count | None, Arg(metavar="N")] = None
-    """processes of this machine (default: one a core)"""
+    """processes on this machine (default: one per core)"""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
     """run on the workers of a Dask scheduler instead, such as tcp://HOST:8786; each needs this
     project installed, and one thread"""
@@ -69,53 +69,53 @@ class StudyFlags(ConfigFlags):
     (default: none)"""
 
     def check(self) -> None:
-        """Refuse two places to run on."""
+        """Refuse contradictory places to run on."""
         super().check()
         if self.cluster is not None and self.workers is not None:
-            raise RunError("--workers are of this machine, --cluster has its own; leave one out")
+            raise RunError("--workers is for this machine, --cluster for others; remove one")
         if self.cluster is not None and self.only is not None:
-            raise RunError("--only runs here, in one process; leave --cluster out")
+            raise RunError("--only runs here, in one process; remove --cluster")
 
 
 class StudyRun(NamedTuple):
-    """A study that runs; for its report, with its rows."""
+    """A running study; with its rows, the input of its report."""
 
     flags: Any
     robot: RobotConfig
     command: str
-    """Runs one case alone, with `--only` and its number added."""
+    """Command that runs one case alone, if `--only` and its number are added."""
     console: Console
     rows: Sequence[Row] = ()
 
 
 class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
-    """What distinguishes one study from the others."""
+    """The properties that distinguish one study from the others."""
 
     name: str
-    """After `xrl study`."""
+    """Word after `xrl study`."""
     case: str = "case"
-    """What a case is called."""
+    """Word for a case."""
     table: str
     """File name of the table; the picture has the same name."""
     load: Callable[[Any], RobotConfig] = lambda flags: experiment.load_robot(flags.config)
     total: Callable[[Any], int] = lambda flags: int(flags.n)
-    """How many cases there are."""
+    """Number of cases."""
     cases: Callable[[Any, RobotConfig], Callable[[int], C]]
-    """Returns what draws the case of a number, whatever was drawn before."""
+    """Returns the function that draws the case with a number, independently of other draws."""
     decided_by: tuple[str, ...] = ()
-    """Flags that decide the rows, beside seed, robot and code; a folder of others is refused."""
+    """Flags that affect the rows, besides seed, robot and code; a folder with others is refused."""
     row: Callable[[Any], dict[str, object]] = scalars
     """The draws of a case by column, its number first."""
     figures: type[msgspec.Struct]
-    """What comes of a case: the other columns."""
+    """The results of a case: the other columns."""
     trial: Callable[[C, RobotConfig, Observer], msgspec.Struct]
-    """Runs a case on its robot: a function of a module."""
+    """Runs a case on its robot; must be a module-level function."""
     robots: Callable[[Sequence[C], RobotConfig, int, Console], Sequence[RobotConfig]] = (
         lambda cases, robot, _workers, _console: [robot] * len(cases)
     )
-    """The robot of each case, prepared by so many processes."""
+    """Returns the robot of each case, prepared by a number of processes."""
     report: Callable[[StudyRun], None]
-    """Prints what came of it."""
+    """Prints the outcome."""
     draw: Callable[[StudyRun], Picture]
     exit_code: Callable[[Row], int] = lambda row: EXIT_CODES[row["ending"]]
     """Exit code of one row of the study; the study's is the `worst` of all."""
@@ -125,7 +125,7 @@ def run(study: Study[C], flags: Any) -> int:
     """Run a study, or one case of it; return the exit code.
 
     Raises:
-        RunError: the folder holds another study, a case failed, or a worker was lost.
+        RunError: the folder contains another study, a case failed, or a worker was lost.
     """
     require("sim")
     robot = study.load(flags)
@@ -159,7 +159,7 @@ def run(study: Study[C], flags: Any) -> int:
     study.report(finished)
     picture = (out / study.table).with_suffix(".png")
     save_figure(study.draw(finished), picture)
-    pace = f"; {case_s:.2f} s a {study.case}" if case_s else ""
+    pace = f"; {case_s:.2f} s per {study.case}" if case_s else ""
     finished.console.print(
         f"{out}/{study.table}, {picture.name}{pace}", style="dim", soft_wrap=True
     )
@@ -167,12 +167,12 @@ def run(study: Study[C], flags: Any) -> int:
 
 
 def _fill(table: CaseTable, study: Study[C], begun: StudyRun, drawn: Sequence[C]) -> float:
-    """Run the cases that a table lacks into it; return the wall time for each, s."""
+    """Run the cases that a table lacks into it; return the wall time per case, s."""
     flags, robot, command, console, _ = begun
     done, workers = table.rows, flags.workers or pool.cores()
     fallen = sum(map(_fell, done))
     if done:
-        console.print(f"{len(done)} of {len(drawn)} cases are done already")
+        console.print(f"{len(done)} of {len(drawn)} cases are already done")
     missing = [case for case in drawn if case.number not in table.numbers]
     robots = study.robots(missing, robot, workers, console)
     results = pool.results(
@@ -239,7 +239,7 @@ def _run_alone(study: Study[C], begun: StudyRun, case: C) -> int:
 def command_of(study: Study[Any], flags: Any) -> str:
     """Return the command of a study with the flags that differ from their defaults.
 
-    Not in it: `--only`, how many cases there are, where they run, and `--out`.
+    It does not contain `--only`, the number of cases, where they run, and `--out`.
     """
     words = [f"xrl study {study.name} --seed {flags.seed}"]
     for field in fields_of(type(flags)):
@@ -257,7 +257,7 @@ def command_of(study: Study[Any], flags: Any) -> str:
 
 
 def _text(value: object) -> str:
-    """Return a flag's value as the command line has it."""
+    """Return a flag's value as written on the command line."""
     if isinstance(value, tuple):
         return ",".join(plain(one) if isinstance(one, float) else str(one) for one in value)
     return f"{value:.12g}" if isinstance(value, float) else str(value)
@@ -277,7 +277,7 @@ def bar(text: str, console: Console) -> Progress:
 
 
 def show(title: str, values: Mapping[str, object], console: Console) -> None:
-    """Print values, one a line; None is left out."""
+    """Print values, one per line, without those that are None."""
     console.print(marked("[bold]{}[/]", title))
     for name, value in values.items():
         if value is not None:
@@ -290,10 +290,10 @@ def show_outcome(
     figures: Sequence[tuple[str, str, str, float]],
     describe: Callable[[Row], str],
 ) -> None:
-    """Print the falls, the median and the worst figures of the others, and the share of falls.
+    """Print the falls, the median and worst figures of the other cases, and the fraction of falls.
 
-    `figures` are column, words, unit, and the sign that is worse; `describe` returns a case in a
-    line.
+    `figures` are column, description, unit, and the sign of the worse direction; `describe`
+    returns a case in one line.
     """
     rows, console, command = finished.rows, finished.console, finished.command
     standing, fallen = parted(rows)
@@ -302,7 +302,7 @@ def show_outcome(
         console.print(f"    {command} --only {row['number']}", style="dim", soft_wrap=True)
     if len(fallen) > FALLS_SHOWN:
         console.print(f"... and {len(fallen) - FALLS_SHOWN} more in the table")
-    printed = Table(title="Those that stood", title_justify="left")
+    printed = Table(title="Cases that stood", title_justify="left")
     for heading in ("what", "median", "worst", "", "case"):
         printed.add_column(heading, justify="left" if heading in ("what", "") else "right")
     for column, words, unit, sign in figures:
@@ -319,7 +319,7 @@ def show_outcome(
     low, high = wilson(len(fallen), len(rows))
     colour = "red" if fallen else "green"
     text = (
-        f"[bold {colour}]{{}} falls of {{}}[/]; share of falls {{:.2f}} to {{:.2f}} % "
+        f"[bold {colour}]{{}} falls of {{}}[/]; fraction of falls {{:.2f}} to {{:.2f}} % "
         "(95 %, Wilson)"
     )
     console.print(marked(text, len(fallen), len(rows), 100 * low, 100 * high), highlight=False)

@@ -1,7 +1,7 @@
 """A study's table: one CSV row per case, in order; an interrupted study resumes.
 
-The file is replaced whole with each row. Beside it, `inputs.json` holds its parameters. A folder
-with other parameters is refused, and so is one that another study is writing to.
+The file is replaced whole with each row. Beside it, `inputs.json` contains its parameters. A folder
+with other parameters is refused, and so is one to which another study is writing.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ INPUTS_FILE: Final = "inputs.json"
 DECIMALS: Final = 9
 """Decimals of a flag's number."""
 Row: TypeAlias = Mapping[str, Any]
-"""A case's draws as they were drawn, then its figures as the table has them."""
+"""A case's draws as drawn, then its figures as in the table."""
 
 
 class CaseTable:
-    """The open table; use it as a context."""
+    """The open table, a context manager."""
 
     def __init__(
         self,
@@ -37,14 +37,14 @@ class CaseTable:
         figures: type[msgspec.Struct],
         inputs: Mapping[str, str],
     ) -> None:
-        """Open a table, new or to resume.
+        """Open a table, a new one or one to resume.
 
-        A row begins with what was drawn for its case, the case's number first, and ends with its
+        A row begins with the draws of its case, the case's number first, and ends with its
         figures. `inputs` are parameters of all rows, by name.
 
         Raises:
-            RunError: the folder cannot be used, another study is writing to it, its parameters are
-                others or unknown, or the table is damaged.
+            RunError: the folder cannot be used, another study is writing to it, its parameters
+                differ or are unknown, or the table is damaged.
         """
         folder = path.parent
         self._path, self._figures = path, figures
@@ -57,7 +57,7 @@ class CaseTable:
                 self._claim(inputs)
                 self._rows = self._read()
             except BaseException:
-                self._inputs.close()  # and no longer locked
+                self._inputs.close()  # which also unlocks it
                 raise
         except OSError as error:
             raise RunError(f"{folder}: {error.strerror}; choose another --out") from None
@@ -67,22 +67,22 @@ class CaseTable:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let another study write there."""
+        """Close the inputs' file, so that another study can write to the folder."""
         self._inputs.close()
 
     @property
     def numbers(self) -> set[int]:
-        """The cases that are done, also those that this call does not ask for."""
+        """The finished cases, including those that this call did not request."""
         return set(self._rows)
 
     @property
     def rows(self) -> list[Row]:
-        """The rows of the asked cases that are done, in order."""
+        """The finished rows of the requested cases, in order."""
         return [self._typed(row) for number, row in sorted(self._rows.items())
                 if number in self._drawn]  # fmt: skip
 
     def add(self, case: Mapping[str, object], figures: msgspec.Struct) -> Row:
-        """Write a row and return it; a value that is None is left empty."""
+        """Write a row and return it; None is written as an empty cell."""
         values = {**case, **msgspec.structs.asdict(figures)}
         row = {name: _text(value) for name, value in values.items()}
         self._rows[int(row[self._columns[0]])] = row
@@ -95,21 +95,21 @@ class CaseTable:
         return self._typed(row)
 
     def _typed(self, row: Mapping[str, str]) -> Row:
-        """Return a row with its values; raise `msgspec.ValidationError` if it is damaged."""
+        """Return a row as values; raise `msgspec.ValidationError` if it is damaged."""
         texts = {name: row[name] or None for name in self._figures.__struct_fields__}
         figures = msgspec.convert(texts, self._figures, strict=False)
         drawn = self._drawn.get(int(row[self._columns[0]]), row)
         return {**drawn, **msgspec.structs.asdict(figures)}
 
     def _claim(self, inputs: Mapping[str, str]) -> None:
-        """Lock the inputs' file; write them into it, or compare them with what it holds."""
+        """Lock the inputs' file; write the inputs into it, or compare them with its content."""
         folder, file = self._path.parent, self._inputs
         others = {one.name for one in folder.iterdir()} - {INPUTS_FILE}
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RunError(
-                f"{folder}: another study is writing there; choose another --out"
+                f"{folder}: another study is writing to it; choose another --out"
             ) from None
         file.seek(0)
         text = file.read()
@@ -124,14 +124,14 @@ class CaseTable:
             if not text:
                 (folder / INPUTS_FILE).unlink()
             raise RunError(
-                f"{folder}: holds other files than a study's, or a damaged {INPUTS_FILE}; choose "
-                "another --out"
+                f"{folder}: contains files that are not a study's, or a damaged {INPUTS_FILE}; "
+                "choose another --out"
             ) from None
         for name, value in inputs.items():
             if there.get(name) != value:
                 raise RunError(
-                    f"{folder}: holds a study of another {name} ({str(there.get(name))[:20]}, now "
-                    f"{value[:20]}); choose another --out"
+                    f"{folder}: contains a study with a different {name} "
+                    f"({str(there.get(name))[:20]}, now {value[:20]}); choose another --out"
                 )
 
     def _read(self) -> dict[int, dict[str, str]]:
@@ -157,5 +157,5 @@ def _text(value: object) -> str:
 
 
 def plain(value: float) -> str:
-    """Return a number in full, to 9 decimals and without an exponent."""
+    """Return a number with up to 9 decimals and without an exponent."""
     return f"{value:.{DECIMALS}f}".rstrip("0").rstrip(".")

@@ -1,7 +1,7 @@
-"""`xrl study wearer`: drawn persons rest, let go, go limp, bump and pull, with park off and on.
+"""`xrl study wearer`: random persons rest, let go, go limp, bump and pull, with park off and on.
 
-Each person and plant is run twice, and differs in nothing but `park.enabled`. A trial follows from
-the seed and its number alone.
+Each person and plant runs twice; only `park.enabled` differs. The seed and the number of a trial
+determine it.
 """
 
 from __future__ import annotations
@@ -38,41 +38,41 @@ from tools.output import Picture, new_figure
 from tools.sim.network import BASE
 
 KINDS: Final = ("squat", "slow", "fast", "let go", "limp", "bump", "pull", "tremor")
-"""slow and fast: the person rests, at 40 to 80 N/s, and at 150 to 500 N/s, and gets up again
+"""slow and fast: the person rests, with 40 to 80 N/s or with 150 to 500 N/s, and gets up again
 within half a second."""
 ACTS_S: Final = 4.0
-"""When the person, who has crouched until then, does what the kind says."""
+"""Time at which the person, who has crouched until then, acts according to the kind, s."""
 RESTS_S: Final = 8.0
 TREMBLES_S: Final = 4.0
 AFTER_S: Final = 2.0
 UP_S: Final = 0.5
-"""Time in which a person who rested gets up."""
+"""Time in which a resting person gets up, s."""
 SETTLED_S: Final = 0.5
-"""After a weight has come; what is carried is measured from then on."""
+"""Time after the weight has come from which the carried force is measured, s."""
 LIMP_N: Final = 200.0
 BUMPS: Final = 5
 
 
 class _WearerTrial(msgspec.Struct, frozen=True, kw_only=True):
-    """A person on a robot."""
+    """A person who wears a robot."""
 
     number: int
     seed: int
     kind: str
     height: float
-    """Of the torso in the crouch, m."""
+    """Torso height in the crouch, m."""
     crouch_s: float
     force: float
     """N"""
     ramp: float
     """s"""
     mass: float
-    """Of the person, kg."""
+    """Mass of the person, kg."""
     payload_scale: float
     park: bool = False
 
     def true_plant(self) -> PlantConfig:
-        """Return the trial's simulated robot, and the person in it."""
+        """Return the trial's simulated robot and person."""
         plant = plants.draw(f"wearer {self.seed} {self.number}")
         person = {"person.mass": self.mass}
         if self.payload_scale:
@@ -80,7 +80,7 @@ class _WearerTrial(msgspec.Struct, frozen=True, kw_only=True):
         return changed(plant, person)
 
     def scenario(self, robot: RobotConfig) -> Scenario:
-        """Return what happens."""
+        """Return the trial as a scenario."""
         stand = robot.simulation.stand_height
         way = [Keyframe(0.0, stand), Keyframe(self.crouch_s, self.height)]
         if self.kind == "squat":
@@ -117,26 +117,26 @@ class _WearerTrial(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _WearerResult(Ended, frozen=True, kw_only=True):
-    """The figures of a trial; None where there is nothing to measure. `_park`: with park on."""
+    """The figures of a trial; None where nothing was measured. `_park`: with park on."""
 
     carried_pct: float | None = None
-    """Of the weight that rests, once it has come."""
+    """Carried fraction of the resting weight, after it has come."""
     carried_pct_park: float | None = None
     sinks_mm: float | None = None
-    """From where it was when the act began, while it lasts."""
+    """Sinking during the act, from the height at its start."""
     sinks_mm_park: float | None = None
     hand_n: float | None = None
     """Largest force of the hand along z: in a squat, or after the act."""
     hand_n_park: float | None = None
     held: bool = False
-    """Modules went to HOLD during the act."""
+    """True if modules went to HOLD during the act."""
     held_park: bool = False
     opened: float | None = None
-    """Share of the bumps that gave height and pitch back."""
+    """Fraction of the bumps that gave height and pitch back."""
 
 
 class WearerStudyFlags(StudyFlags):
-    """How many."""
+    """Number of persons."""
 
     n: Count = 20
     """persons of each kind"""
@@ -150,7 +150,7 @@ xrl study wearer --only 9 --out out/trial9
 
 
 def draw(seed: int, number: int) -> _WearerTrial:
-    """Return one trial; no other trial has to be drawn for it."""
+    """Return one trial, which does not depend on any other trial."""
     dice = random.Random(f"wearer {seed} {number}")
     kind = KINDS[number % len(KINDS)]
     force = {"pull": (25.0, 50.0), "tremor": (3.0, 10.0)}.get(kind, (40.0, 150.0))
@@ -176,7 +176,7 @@ def draw(seed: int, number: int) -> _WearerTrial:
 def run_trial(
     trial: _WearerTrial, robot: RobotConfig, observer: Observer = NOBODY
 ) -> _WearerResult:
-    """Run a trial twice, with park off and on; the observer sees the second run."""
+    """Run a trial twice, with park off and on; the observer gets the second run."""
     found: dict[str, object] = {}
     endings = []
     for park, watches in ((False, NOBODY), (True, observer)):
@@ -197,7 +197,7 @@ def run_trial(
 
 def _measured(trial: _WearerTrial, run: CaseRun) -> dict[str, object]:
     rows = [row for row in run.rows if row.scenario_s >= 0.0]
-    acts = trial._acts()  # noqa: SLF001 - of this file
+    acts = trial._acts()  # noqa: SLF001 - defined in this file
     end_s = acts[0].at + acts[0].duration if acts else 0.0
     inside = [row for row in rows if ACTS_S <= row.scenario_s <= end_s]
     after = [row for row in rows if row.scenario_s > end_s]
@@ -219,7 +219,7 @@ def _hand(rows: Sequence[SimTruth]) -> float | None:
 
 
 def _opened(run: CaseRun) -> int:
-    """Return how often a parked robot was given back after the first bump."""
+    """Return how often a parked robot was opened again after the first bump."""
     begin_ns = next(row.t_ns for row in run.rows if row.scenario_s >= ACTS_S + 1.0)
     seen = [
         row.wearer == Wearing.LEADS
@@ -230,11 +230,11 @@ def _opened(run: CaseRun) -> int:
 
 
 FIGURES: Final = (
-    ("carried_pct", "carries of what rests on it", "%", -1.0),
+    ("carried_pct", "carries of the resting weight", "%", -1.0),
     ("sinks_mm", "sinks", "mm", 1.0),
     ("hand_n", "hand, squat or after it", "N", 1.0),
 )
-"""Column, words, unit, and the sign that is worse."""
+"""Column, description, unit, and the sign of the worse direction."""
 
 
 def _report(finished: StudyRun) -> None:
@@ -257,7 +257,7 @@ def _report(finished: StudyRun) -> None:
         table.add_row("went to HOLD", *map(str, held), "")
         opened = [float(row["opened"]) for row in rows if row["opened"] is not None]
         if opened:
-            table.add_row("bumps that opened it", "-", f"{100 * np.mean(opened):.0f}", "%")
+            table.add_row("bumps that opened park", "-", f"{100 * np.mean(opened):.0f}", "%")
         finished.console.print(title, style="bold", highlight=False)
         finished.console.print(table)
 
@@ -270,7 +270,7 @@ def _cell(rows: Sequence[Row], column: str, sign: float) -> str:
 
 
 def _draw(finished: StudyRun) -> Picture:
-    """Draw how far it sinks under what rests on it, with park off and on."""
+    """Draw the sinking under the resting weight, with park off and on."""
     figure = new_figure(9, 5)
     axis = figure.subplots()
     for suffix, label, colour in (("", "park off", "#c0392b"), ("_park", "park on", "#1f5f8b")):
@@ -296,7 +296,7 @@ STUDY: Final = Study[_WearerTrial](
     figures=_WearerResult,
     trial=run_trial,
     report=_report,
-    # a payload that is too far from the file is not led, and nothing is wrong with that
+    # the planner does not lead a payload that is too far from the file, which is not a fault
     exit_code=lambda row: 0 if row["ending"] == Ending.UNREADY else EXIT_CODES[row["ending"]],
     draw=_draw,
 )

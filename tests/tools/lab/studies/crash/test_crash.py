@@ -435,7 +435,7 @@ def test_a_run_on_a_machine_that_was_too_slow_is_marked(
 
 def test_a_service_that_ends_by_itself_is_remarked(robot: RobotConfig) -> None:
     run = heard(PLANNER, holds())._replace(died=["harness"])
-    assert measure(PLANNER, run, robot).remarks == "harness ended by itself"
+    assert measure(PLANNER, run, robot).remarks == "harness ended on its own"
 
 
 def test_the_torque_step_is_of_the_modules_that_were_not_hit(robot: RobotConfig) -> None:

@@ -39,12 +39,12 @@ def test_the_same_seed_gives_the_same_table_resumed_and_with_any_number_of_worke
     a, b = tmp_path / "a", tmp_path / "b"
     assert toy(seed=7, n=2, workers=1, out=a) == 0
     assert toy(seed=7, n=5, workers=1, out=a) == FELL_EXIT_CODE
-    assert "2 of 5 cases are done already" in capsys.readouterr().out
+    assert "2 of 5 cases are already done" in capsys.readouterr().out
     assert toy(seed=7, n=5, workers=2, out=b) == FELL_EXIT_CODE
     assert (a / "toy.csv").read_bytes() == (b / "toy.csv").read_bytes()
     assert [row["ending"] for row in rows_of(b / "toy.csv")].count("fell") == 1
     assert (b / "toy.png").exists()
-    with pytest.raises(RunError, match="holds a study of another seed"):
+    with pytest.raises(RunError, match="contains a study with a different seed"):
         toy(seed=6, out=a)
 
 
@@ -108,7 +108,7 @@ def test_a_study_on_a_real_cluster_is_that_of_this_machine_and_other_code_is_ref
         address = local.scheduler_address
         toy(seed=7, n=3, cluster=address, out=tmp_path / "a")
         monkeypatch.setattr(pool, "code_digest", lambda: "another")
-        with pytest.raises(RunError, match="other code"):
+        with pytest.raises(RunError, match="different code"):
             list(pool.results(square, [1, 2], 1, str, address))
     monkeypatch.undo()
     toy(seed=7, n=3, workers=1, out=tmp_path / "b")
@@ -302,7 +302,7 @@ def test_a_row_comes_back_with_its_values_as_drawn_and_as_measured(tmp_path: Pat
 
 def test_a_folder_of_other_inputs_is_refused(tmp_path: Path) -> None:
     filled(tmp_path, 1)
-    with pytest.raises(RunError, match=r"another seed \(1, now 2\); choose another --out"):
+    with pytest.raises(RunError, match=r"a different seed \(1, now 2\); choose another --out"):
         table_in(tmp_path, inputs=INPUTS | {"seed": "2"})
     with pytest.raises(RunError, match="other columns"):
         table_in(tmp_path, [{"number": 1, "drawn": 0.5, "more": 1}])
@@ -348,7 +348,7 @@ def test_a_study_cut_off_before_it_wrote_anything_is_begun_again(tmp_path: Path)
 
 def test_two_studies_do_not_write_into_one_table(tmp_path: Path) -> None:
     with table_in(tmp_path) as first:
-        with pytest.raises(RunError, match="another study is writing there"):
+        with pytest.raises(RunError, match="another study is writing to it"):
             table_in(tmp_path)
         first.add(DRAWN[0], Figures(0.5))
     with table_in(tmp_path) as second:
@@ -357,6 +357,6 @@ def test_two_studies_do_not_write_into_one_table(tmp_path: Path) -> None:
 
 def test_a_folder_of_something_else_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(b"a run")
-    with pytest.raises(RunError, match="holds other files than a study's"):
+    with pytest.raises(RunError, match="contains files that are not a study's"):
         table_in(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
