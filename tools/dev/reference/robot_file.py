@@ -161,7 +161,7 @@ def _described(hint: Any) -> tuple[str, str, str]:
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
         limits = next(meta for meta in args[1:] if isinstance(meta, Range))
-        return args[0].__name__, limits.unit, f"{limits.low:g} .. {limits.high:g}"
+        return args[0].__name__, limits.unit, f"{limits.low:g}..{limits.high:g}"
     if origin is Literal:
         texts = (f'"{value}"' if isinstance(value, str) else value for value in args)
         return " or ".join(f"`{text}`" for text in texts), "", ""
@@ -175,8 +175,8 @@ def _described(hint: Any) -> tuple[str, str, str]:
 def _array(args: tuple[Any, ...]) -> tuple[str, str, str]:
     if args[-1] is Ellipsis:
         kind, unit, limits = _described(args[0])
-        return f"array of {kind}", unit, limits
+        return f"{kind}[]", unit, limits
     parts = [_described(part) for part in args]
     kind = parts[0][0]
     units, ranges = (list(dict.fromkeys(part[i] for part in parts)) for i in (1, 2))
-    return f"array of {len(parts)}: {kind}", ", ".join(units), "; ".join(ranges)
+    return f"{kind}[{len(parts)}]", ", ".join(units), "; ".join(ranges)
