@@ -138,7 +138,7 @@ def has_real_time(pid: int) -> bool | None:
 
 
 def real_time_pause_ms(root: Path = Path("/")) -> float:
-    """Return how long the kernel pauses real-time processes that have filled a processor, ms.
+    """Return how long the kernel pauses real-time processes that fill a processor, ms.
 
     By default 50 ms of each second. 0: never, or unknown.
     """

@@ -3,7 +3,7 @@
 Each motor's own loop holds a module's mean stiffness and damping about the references. The rest
 (difference of the two axes, feedforward, the limiter's reduction) is sent as torque, computed for
 each sample. So at every sample the drive gives exactly the torque of the service. Between samples,
-and after the service has died, its own law
+and after the service has died, the drive's own law
 
     torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel)
 

@@ -3,8 +3,8 @@
 The first is the service's last state, for its successor. A module that lost torque is never
 re-armed automatically (`shared.robot.fault_table`). But the supervisor restarts a service that
 crashed, and meanwhile its drive may have disarmed or an emergency stop may be active. Without the
-last state, the new service would arm and stiffen the module unasked. A person who requests the
-module (`xrl kill`, `xrl start`, `xrl up`) clears it.
+last state, the new service would arm and stiffen the module unasked. A person's command
+for the module (`xrl kill`, `xrl start`, `xrl up`) clears it.
 
 The second is an emergency stop from the robot's own host (`xrl estop`). It works with the planner
 dead and every link of the bus cut, and stays active until a person restarts the module.

@@ -148,7 +148,7 @@ class Recorder:
                 pass
 
     def close(self) -> None:
-        """Write the queued rest; the writer finishes the file."""
+        """Write what is still queued; the writer finishes the file."""
         self._writer.take_from(self._source, _AT_ONCE)
         self._leave_if_gone()
 

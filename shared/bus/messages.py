@@ -191,7 +191,7 @@ class PlannerMode(IntEnum):
     MISPLACED = 5
     """Feet beyond `law.stance_max`, or just moved."""
     TRIPPED = 6
-    """Tripped (`PlannerStatus.trip`), until every value is calm."""
+    """Tripped (`PlannerStatus.trip`), until every value is back within its limit."""
     MISLOADED = 7
     """Load beyond `law.load_correction`, or not yet weighed after the hoist."""
     YIELDING = 8

@@ -131,7 +131,7 @@ def test_on_the_emulated_robot_an_interrupt_and_a_service_stop_it(
         )
         assert process.stdout is not None
         for line in process.stdout:
-            if "asked" in line and "1." in line.split(" s ")[0]:
+            if "reference" in line and "1." in line.split(" s ")[0]:
                 break
         process.send_signal(signal.SIGINT)
         output, _ = process.communicate(timeout=60)

@@ -148,7 +148,7 @@ def number(values: Mapping[str, Value], name: str) -> float:
     """Return a value that must be a number."""
     value = values.get(name)
     if not isinstance(value, int | float):
-        raise DriveError(f"no number at {name}; it must be an ODrive v3 with firmware 0.5.x")
+        raise DriveError(f"no number at {name}; the board must be an ODrive v3 with firmware 0.5.x")
     return value
 
 

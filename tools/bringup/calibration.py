@@ -371,8 +371,8 @@ def refuse_standing(
             states = _can_states(robot, module, run_dir)
         if AxisState.CLOSED_LOOP_CONTROL in states:
             raise DriveError(
-                f"the drive of {module} is armed: the robot may stand on it. Hang the robot, then "
-                "run `xrl down` or switch its supply off"
+                f"the drive of {module} is armed: the robot may be standing on it. Hang the robot, "
+                "then run `xrl down` or switch its supply off"
             )
     for module in axes:
         leg = leg_of(module)

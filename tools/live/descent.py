@@ -316,7 +316,9 @@ def lower(robot: RobotConfig, run_dir: Path, tell: Tell, *, wait_s: float, simul
         with open_session(robot, "down", run_dir) as session:
             _Lowering(robot, session, tell, simulated=simulated).run(Descent(robot, wait_s))
     except BusError as error:
-        raise FleetError(f"{error}; so it is unknown whether it carries weight: {WAYS}") from None
+        raise FleetError(
+            f"{error}; so it is unknown whether the robot bears weight: {WAYS}"
+        ) from None
 
 
 class _Lowering:

@@ -114,7 +114,7 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
             if is_given and service in absent:
                 why = "--no-sim" if only is None or service in only else "--only"
                 raise FleetError(
-                    f"{option} needs the {service}, which {why} does not start; remove one of them"
+                    f"{option} needs the {service}, which {why} leaves out; remove one of the two"
                 )
         for option, given in (("--domain", self.domain), ("--accept", self.accept)):
             if given is not None and not self.ros2:

@@ -39,7 +39,7 @@ drivetrain and a mass error of 5 % look like 8 kg."""
 STILL_RATES: Final = (0.05, 0.1)
 """m/s of the harness point and rad/s of the torso's pitch; slower counts as rest."""
 FRICTION_BAND: Final = (8.0, 1.5)
-"""N and N m of the open directions that dry friction may hide (0.3 N m a joint: 6 N)."""
+"""Force, N, and moment, N m, that dry friction may hide (0.3 N m a joint hides 6 N)."""
 WEIGHING_S: Final = 1.0
 """s; time for which a lowered robot's load must stay within the limits: four time constants."""
 RESUME_FRACTION: Final = 0.8

@@ -34,7 +34,7 @@ from shared.robot.fault_table import FALLEN_REMEDY
 from shared.robot.trip_table import limits_of
 
 AFTER_NS: Final = 150 * NS_PER_MS
-"""A robot that is caught in time swings back sooner."""
+"""Two signs must agree for this long; a robot that is caught in time swings back sooner."""
 MOMENT_NS: Final = 500 * NS_PER_MS
 """From tipping over an edge to the floor, a fall takes 0.5 to 0.8 s."""
 TILT_MAX: Final = 0.5

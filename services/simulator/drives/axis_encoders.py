@@ -204,7 +204,7 @@ class AxisEncoders:
         self.set_count(axis, self.angle(axis))
 
     def read_words(self, axis: int, words: Words) -> None:
-        """Make an axis read no words of its encoder, zeros, or true words again."""
+        """Make an axis read nothing from its encoder, read zeros, or read true words again."""
         if self._seen != self._settings.version:
             self._derive()
         odd = self.odd.get(axis)

@@ -163,7 +163,7 @@ class Settings:
         number = float(value)
         whole = isinstance(default, int)
         if math.isnan(number) or (whole and not number.is_integer()):
-            raise DriveError(f"{name} = {value!r}: it must be a {type(default).__name__}")
+            raise DriveError(f"{name} = {value!r}: it must be of type {type(default).__name__}")
         column[row] = bool(value) if isinstance(default, bool) else number
         self.version += 1
 

@@ -58,7 +58,9 @@ def write_gif(
     began = next((event.t_ns for event in events if event.kind == RunEventKind.STARTED), 0)
     chosen = [pose for pose in poses(log, robot, FRAMES_S) if pose.t_ns >= began]
     if not chosen:
-        raise RunError(f"{log.path}: the scenario never started; there is nothing to draw")
+        raise RunError(
+            f"{log.path}: no pose after the start of the scenario; there is nothing to draw"
+        )
     images = []
     for number, pose in enumerate(chosen):
         image = Image.new("RGB", (SIZE[0] * SCALE, SIZE[1] * SCALE), BACKGROUND)
