@@ -205,7 +205,9 @@ def test_a_robot_one_of_whose_drives_is_armed_is_refused_by_usb_or_by_can(
         return BusTraffic(nodes={node: NodeTraffic(heartbeat=beat) for node in nodes})
 
     monkeypatch.setattr(calibration.can_monitor, "listen", listen)
-    armed = "knee_left is armed: the robot may be standing" in refusal(robot, made, "hip_right", tmp_path)
+    armed = "knee_left is armed: the robot may be standing" in refusal(
+        robot, made, "hip_right", tmp_path
+    )
     assert armed == (state == AxisState.CLOSED_LOOP_CONTROL)
 
 
