@@ -181,18 +181,26 @@ class AssistConfig(Section, frozen=True):
     fade_s: Annotated[float, Range(0.5, 60.0, "s")] = 5.0
 
 
+OpenForce = Annotated[float, Range(10.0, 100.0, "N")]
+OpenMoment = Annotated[float, Range(2.0, 50.0, "N m")]
+StillTime = Annotated[float, Range(0.1, 5.0, "s")]
+
+
 class WearerThresholds(Section, frozen=True):
-    """Thresholds of one wearer; `xrl log wearer` measures them."""
+    """A person's thresholds of park, all of them; `xrl log wearer` measures them."""
 
-    open_n: Annotated[float, Range(10.0, 100.0, "N")] = 22.0
-    open_back_nm: Annotated[float, Range(2.0, 50.0, "N m")] = 6.0
-    still_s: Annotated[float, Range(0.1, 5.0, "s")] = 1.0
+    open_n: OpenForce
+    open_back_nm: OpenMoment
+    still_s: StillTime
 
 
-class ParkConfig(WearerThresholds, frozen=True):
+class ParkConfig(Section, frozen=True):
     """Parking: a person may rest on a crouched robot that stands still (docs/law.md#park)."""
 
     enabled: bool = False
+    open_n: OpenForce = 22.0
+    open_back_nm: OpenMoment = 6.0
+    still_s: StillTime = 1.0
 
 
 LocalStiffness = Annotated[float, Range(0.0, 1e4, "N m/rad")]

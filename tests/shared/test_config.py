@@ -307,6 +307,9 @@ def test_the_file_of_the_person_who_wears_it_stands_beside_the_robot_file(tmp_pa
     park = config_file.load(robot_file).park
     assert (park.open_n, park.open_back_nm, park.still_s) == (31.0, 7.5, 0.6)
     assert park.enabled == config_file.load(ROBOT_FILE).park.enabled
-    wearer.write_text("open_n = 310.0\n")
+    wearer.write_text("open_n = 31.0\n")
+    with pytest.raises(ConfigError, match=r"lab\.wearer\.toml: open_back_nm: missing"):
+        config_file.load(robot_file)
+    wearer.write_text("open_n = 310.0\nopen_back_nm = 7.5\nstill_s = 0.6\n")
     with pytest.raises(ConfigError, match=r"lab\.wearer\.toml: open_n: 310"):
         config_file.load(robot_file)

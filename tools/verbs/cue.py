@@ -24,6 +24,8 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console
 
 POLL_S: Final = 0.005
+ENDS_IN_S: Final = 1.0
+"""Timeout for the command to end after SIGTERM."""
 SILENT_S: Final = 0.5
 """A module or planner that is silent for this time counts as not following."""
 
@@ -119,8 +121,18 @@ def run(flags: CueFlags) -> int:
                     sounding.terminate()
                 sounding = _start([*flags.command, now.value]) if flags.command else None
     if sounding is not None:
-        sounding.wait()
+        _end(sounding)
     return 0
+
+
+def _end(sounding: subprocess.Popen[bytes]) -> None:
+    """End a command that may still run."""
+    sounding.terminate()
+    try:
+        sounding.wait(ENDS_IN_S)
+    except subprocess.TimeoutExpired:
+        sounding.kill()
+        sounding.wait()
 
 
 def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:

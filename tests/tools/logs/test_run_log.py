@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -10,10 +12,11 @@ from shared.exceptions import RunError
 from shared.mcap_log.reader import ChunkPlace, LogReader
 from shared.mcap_log.records import PREFIX
 from shared.mcap_log.writer import SCHEMA_VERSION
+from tests.conftest import ROBOT_FILE
 from tests.shared.mcap_log import runs
 from tests.shared.mcap_log.runs import ATTACHMENTS, OFFSET_NS, ROBOT, STATE_KEY, Killed, Queue, item
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import parts_of, read_run
+from tools.logs.run_log import RunLog, parts_of, read_run, robot_of
 
 WRENCH_KEY = topics.WRENCH.key(ROBOT)
 
@@ -127,3 +130,13 @@ def test_a_flipped_bit_in_the_times_of_a_chunk_loses_none_of_its_messages(
     for part in parts_of(index, part_s=index.length_s / 5, margin_s=0.0):
         found += part.messages(topics.JOINT_STATE, "knee_right")
     assert found == [runs.state(seq) for seq in range(killed.flushed[-1][1])]
+
+
+def test_the_robot_of_a_log_has_the_thresholds_of_the_person_who_wore_it() -> None:
+    files = {
+        "robot.toml": ROBOT_FILE.read_bytes(),
+        "robot.wearer.toml": b"open_n = 31.0\nopen_back_nm = 7.5\nstill_s = 0.6\n",
+    }
+    log = cast(RunLog, SimpleNamespace(path="a.mcap", attachments=files))
+    park = robot_of(log).park
+    assert (park.open_n, park.open_back_nm, park.still_s) == (31.0, 7.5, 0.6)
