@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# mypyc 2.4.1 drops the options of a msgspec 0.22.0 Struct, without a warning.
+# mypyc 2.4.1 drops the options of a msgspec 0.22.0 Struct without a warning.
 #
-# Guess: a module that mypyc compiles behaves as its source does, or mypyc refuses it. Options such as
-# `frozen=True` are keywords of the class statement, so the compiled class has them, or there is an error.
-# Seen: compilation succeeds. The compiled class is neither frozen nor hashable nor tagged: an attribute
-# can be set, hash() raises TypeError, and the JSON lacks the tag. `kw_only=True` is dropped too, which
-# shows only where a required field follows an optional one: the import then fails.
-# So a joint service whose laws keep their state in structs cannot be compiled by mypyc as it is; that was
-# tried to make a control cycle cheaper.
+# Guess: a compiled module behaves like its source, or mypyc refuses to compile it. So a compiled class
+# has the options of its class statement, such as `frozen=True`.
+# Result: compilation succeeds, but the compiled class is neither frozen nor hashable nor tagged. An
+# attribute can be set, hash() raises TypeError, and the JSON lacks the tag. mypyc also drops
+# `kw_only=True`; the import then fails if a required field follows an optional field.
+# Therefore mypyc cannot make the joint service's control cycle faster, because its laws keep their state
+# in structs.
 #
-# Needs python3 with venv and headers, and a C compiler. It fails if the behaviour has changed.
+# Needs python3 with venv and headers, and a C compiler.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -69,7 +69,11 @@ def nodes_of(kind: type[N], *folders: str) -> Iterator[tuple[str, N]]:
 
 VENDORS = {
     "getpass": ["shared/places.py"],
-    "zenoh": ["shared/bus/session.py", "services/ros2_gateway/ros_session.py"],
+    "zenoh": [
+        "shared/bus/pubsub.py",
+        "shared/bus/session.py",
+        "services/ros2_gateway/ros_session.py",
+    ],
     "rosbags": ["services/ros2_gateway/conversions.py", "tools/export/ros2_bag.py"],
     "shtab": ["tools/verbs/completion.py"],
     "mujoco": [

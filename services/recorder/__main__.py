@@ -1,12 +1,12 @@
 """Recorder: `python -m services.recorder --out DIR` writes DIR/run.mcap until stopped.
 
-A new run never replaces a file: it is then called run-1.mcap, run-2.mcap, ... A long run is split
-into run.mcap, run_1.mcap, ... as `[recorder]` of the robot file says. Meanwhile, unfinished files
-of earlier recorders in DIR are recovered. SIGTERM and SIGINT finish the file; after SIGKILL the
-next recorder, or `xrl log recover`, recovers what was flushed.
+A run never replaces a file: if run.mcap exists, the run is named run-1.mcap, run-2.mcap, ...
+`[recorder]` of the robot file sets when a long run is split into run.mcap, run_1.mcap, ... The
+recorder also recovers unfinished files of earlier recorders in DIR. SIGTERM and SIGINT finish the
+file. After SIGKILL the next recorder, or `xrl log recover`, recovers the flushed messages.
 
-With --of it is one host's own recorder: it dials only these services, and records them even if the
-network to the fleet's recorder is cut.
+With --of it records only the named services of its own host, and continues if the network to the
+fleet's recorder is cut.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ from shared.mcap_log.writer import SCHEMA_VERSION, RunWriter
 from shared.process import StopFlag, run_service, service_parser
 
 DRAIN_PERIOD_S: Final = 0.02
-"""Bounds how late `log_time` is, beside the 20 ms of a batch. 5, 10 and 20 ms cost the same CPU."""
+"""Period of the recorder's cycles, s. Together with the 20 ms of a batch, it limits the delay of
+`log_time`. 5, 10 and 20 ms cost the same CPU time."""
 
 LAST_WORDS_S: Final = 0.1
-"""Time after a stop in which last messages of other stopping services are recorded, s."""
+"""Time after a stop for which the last messages of other stopping services are recorded, s."""
 
 
 def main() -> int:
@@ -55,7 +56,7 @@ def main() -> int:
     metadata = _metadata(config.name, arguments, config.recorder)
     recorded = _recorded(config.name, arguments.of)
     granted = scheduling.apply("recorder")
-    # The bus before the file: if the endpoint is in use, no empty file is left behind.
+    # Open the bus before the file: if the endpoint is in use, no empty file is left behind.
     name = topics.HOST_RECORDER if arguments.of else topics.RECORDER
     with open_session(config, name, arguments.run_dir, only=arguments.of) as session:
         stream = session.recording()
@@ -84,16 +85,16 @@ def main() -> int:
             return error.exit_code
         finally:
             auto_recovery.halt()
-    return _tell_end(writer, recording, summary(writer), logger)
+    return _tell_end(writer, recording, summary(writer, stream), logger)
 
 
 def _tell_end(writer: RunWriter, recording: Recorder, counts: str, logger: logging.Logger) -> int:
-    """Log what was recorded; return the exit code, 2 if one of its files was removed."""
+    """Log the counts; return the exit code, which is 2 if a file was removed."""
     what = f"finished {writer.path}" if writer.path.exists() else "nothing written"
     logger.info("%s: %s", what, counts)
     if recording.removed_files:
         logger.error(
-            "%d of %d files were removed while being written, with %d of the messages",
+            "removed while being written: %d of %d files, with %d of the messages",
             recording.removed_files, writer.begun, recording.removed_messages,
         )  # fmt: skip
         return RunError.exit_code
@@ -101,7 +102,7 @@ def _tell_end(writer: RunWriter, recording: Recorder, counts: str, logger: loggi
 
 
 def _recorded(robot: str, of: tuple[str, ...] | None) -> dict[str, topics.Topic]:
-    """Return the keys to record with their topics: all, or those that some services write."""
+    """Return the keys to record with their topics: all, or those that the services `of` write."""
     wanted = (
         None if of is None else {key for name in of for key in topics.written_keys(robot, name)}
     )
@@ -118,7 +119,6 @@ def _record(
     roster: Roster | None,
     host: RunDirWatch,
 ) -> None:
-    """Record until `stop`, then write the queued rest."""
     while not stop:
         now = now_ns()
         if roster is not None:
@@ -133,7 +133,7 @@ def _record(
 
 def _about(writer: RunWriter, keys: int) -> str:
     if not writer.recording:
-        return f"waiting for space to record {keys} keys"
+        return f"waiting for disk space to record {keys} keys"
     beside = "" if writer.path.name == FIRST else f" ({FIRST} exists already and is kept)"
     return f"recording {keys} keys to {writer.path}{beside}"
 
@@ -182,7 +182,7 @@ def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
     for text in arguments.attach:
         name, equals, file = text.partition("=")
         if not (name and equals and file) or name in files:
-            raise ConfigError("--attach", "NAME=FILE", repr(text), "give a new name, = and a file")
+            raise ConfigError("--attach", "NAME=FILE", repr(text), "use NAME=FILE, with a new NAME")
         files[name] = Path(file)
     contents = {}
     for name, path in files.items():
@@ -191,7 +191,7 @@ def _attachments(arguments: argparse.Namespace) -> dict[str, bytes]:
         except OSError as error:
             found = f"cannot be read: {error.strerror}"
             raise ConfigError(
-                str(path), "(file)", found, f"it must be readable, to be attached as {name}"
+                str(path), "(file)", found, f"give a readable file to attach as {name}"
             ) from None
     return contents
 

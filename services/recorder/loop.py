@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 from services.recorder.host_watch import MIB, Deadline, DiskChange, SpaceGuard
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -17,15 +17,23 @@ _AT_ONCE: Final = 65_536
 
 REPORT_PERIOD_S: Final = 10.0
 
+
+class _BusSource(MessageSource, Protocol):
+    """The recorder's stream of messages from the bus."""
+
+    misdelivered: int
+    """Messages that were dropped because they were not sent to the key that they arrived under."""
+
+
 FreeBytes = Callable[[], int]
 
 
 class Recorder:
-    """Moves messages from the bus into files, in cycles of a few milliseconds."""
+    """Moves messages from the bus into files, in cycles of 20 ms."""
 
     def __init__(
         self,
-        source: MessageSource,
+        source: _BusSource,
         writer: RunWriter,
         config: RecorderConfig,
         logger: logging.Logger,
@@ -35,8 +43,8 @@ class Recorder:
     ) -> None:
         """Check the disk, and start the first file.
 
-        `writer` has no file started; `free_bytes` returns the free space where the run is written.
-        Raises RunError if a file cannot be written, as all methods do.
+        `writer` must not have started a file; `free_bytes` returns the free space where the run is
+        written. Like all methods, it raises RunError if a file cannot be written.
         """
         self._source, self._writer = source, writer
         self._logger, self._free_bytes = logger, free_bytes
@@ -47,17 +55,17 @@ class Recorder:
         self._report = Deadline(int(REPORT_PERIOD_S * NS_PER_S), now_ns)
         self._begun_ns = now_ns
         self.removed_files = self.removed_messages = 0
-        """Files that were removed while they were written, and their messages."""
+        """Number of files that were removed while being written, and of the messages in them."""
         self._why_next = ""
-        """Why a new file must be started as soon as possible; "" if none must."""
+        """Reason to start a new file as soon as possible; "" without one."""
         self._reported_unwritable = False
         self.trouble = ""
-        """Why nothing is recorded now; "" while recording."""
+        """Reason why nothing is recorded; "" while recording."""
         self._watch_space()
         self._begin(now_ns, {})
 
     def cycle(self, now_ns: int) -> None:
-        """Write new messages, and do what is due."""
+        """Write new messages; flush, sync, split and report when due."""
         self._writer.take_from(self._source, _AT_ONCE)
         flush = self._flush.passed(now_ns)
         if self._sync.passed(now_ns):  # flushes as well
@@ -69,7 +77,7 @@ class Recorder:
             self._watch_file(now_ns)
             self._split_if_due(now_ns)
         if self._report.passed(now_ns):
-            self._logger.info("%s", summary(self._writer))
+            self._logger.info("%s", summary(self._writer, self._source))
 
     def _begin(self, now_ns: int, note: dict[str, str]) -> None:
         if self._guard.enough:
@@ -102,7 +110,7 @@ class Recorder:
         self._why_next, self._reported_unwritable, self.trouble = "", False, ""
         left_out = self._writer.left_out
         self._logger.warning(
-            "recording continues in %s; %d messages were left out", self._writer.path, left_out
+            "recording continues in %s; messages left out so far: %d", self._writer.path, left_out
         )
 
     def _leave_if_gone(self) -> None:
@@ -121,16 +129,17 @@ class Recorder:
         self._why_next = f"the previous file was {place.value}"
 
     def _watch_space(self) -> None:
-        """Stop recording before the disk is full, and continue when it no longer is."""
+        """Pause recording before the disk is full, and continue once there is space."""
         try:
             free = self._free_bytes()
-        except OSError:  # writing will show it
+        except OSError:  # the next write reports it
             return
         where, least = self._writer.path.parent, self._config.free_min_mib
         match self._guard.feed(free):
             case DiskChange.LOW:
                 self._logger.warning(
-                    "%s: %d MiB free; recording stops below %d MiB (recorder.free_min_mib)",
+                    "%s: %d MiB free; recording stops below %d MiB (recorder.free_min_mib); "
+                    "free some space",
                     where, free // MIB, least,
                 )  # fmt: skip
             case DiskChange.FULL:
@@ -148,12 +157,12 @@ class Recorder:
                 pass
 
     def close(self) -> None:
-        """Write what is still queued; the writer finishes the file."""
+        """Write the messages that are still queued; the writer finishes the file."""
         self._writer.take_from(self._source, _AT_ONCE)
         self._leave_if_gone()
 
 
-def summary(writer: RunWriter) -> str:
+def summary(writer: RunWriter, source: _BusSource) -> str:
     """Return the counts in one line."""
     counts = writer.counts.values()
     line = (
@@ -166,6 +175,8 @@ def summary(writer: RunWriter) -> str:
     for what, keys in (("unknown keys", writer.unknown), ("malformed", writer.malformed)):
         if keys:
             line += f"; {sum(keys.values())} left out, {what}: {', '.join(sorted(keys))}"
+    if source.misdelivered:
+        line += f"; {source.misdelivered} left out, delivered under another key"
     if writer.left_out:
         line += f"; {writer.left_out} left out while no file could be written"
     return line

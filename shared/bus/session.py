@@ -1,12 +1,9 @@
-"""The bus: publishers, subscribers and the links between processes (docs/networks.md).
+"""Sessions on the bus, and the links between processes (docs/networks.md).
 
-Only this file and the gateway's session with ROS 2 use Zenoh. Every service is a peer with a fixed
-endpoint. There is no router, no scouting and no gossip, and a peer forwards nothing. So each pair
-of services has its own link, except two joint services, and a tool links with each service
-(`peers_of`).
-
-On the control path (`Publisher.put`, `Latest.take`) nothing blocks or raises. A message that cannot
-be sent or decoded is counted, and its absence shows as age. RUST_LOG=info shows Zenoh's own log.
+Only `shared/bus` and the gateway's session with ROS 2 use Zenoh. Every service is a peer with a
+fixed endpoint. There is no router, no scouting and no gossip, and a peer forwards nothing. So each
+pair of services, except two joint services, has its own link, and a tool links with each service
+(`peers_of`). RUST_LOG=info shows Zenoh's own log.
 """
 
 from __future__ import annotations
@@ -17,36 +14,40 @@ import json
 import os
 import re
 import socket
-import threading
-from collections import deque
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, Generic, Self, TypeAlias, TypeVar
+from typing import Final, Self, TypeVar
 
-import msgspec
 import zenoh
 
 from shared import log
 from shared.bus import security, sockets, tls_probe, topics
-from shared.bus.codec import Decoder, encode
+from shared.bus.codec import encode
 from shared.bus.credentials import read_credentials
 from shared.bus.messages import Message
+from shared.bus.pubsub import (
+    BatchSender,
+    Latest,
+    LatestInBatch,
+    Publisher,
+    RawPublisher,
+    Recording,
+    Stream,
+    Subscriber,
+    addressed,
+)
 from shared.bus.security import alive_prefix, token_key, tools_prefix
 from shared.bus.topics import Priority, Topic
-from shared.bus.traces import Batch
-from shared.clock import keep_pace, now_ns
+from shared.clock import keep_pace
 from shared.config.endpoints import host_and_port, is_endpoint
 from shared.config.robot_config import SERVICES, RobotConfig, expand
-from shared.exceptions import BusError, EncodeError
+from shared.exceptions import BusError
 from shared.joints import MODULES
 from shared.links import PAIRS, Pair, endpoint_through
 from shared.process import SOCKET_PATH_MAX
 from shared.run_directory import private_files
 
 M = TypeVar("M", bound=Message)
-T = TypeVar("T")
-_Put: TypeAlias = Callable[[bytes], None]
-_Subscriber: TypeAlias = "zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]"
 
 _SETTINGS: Final[dict[str, object]] = {
     "mode": "peer",
@@ -59,7 +60,7 @@ _SETTINGS: Final[dict[str, object]] = {
     "connect/exit_on_failure": False,
     # One object: Zenoh has no keys for its parts.
     "connect/retry": {"period_init_ms": 20, "period_max_ms": 200, "period_increase_factor": 2.0},
-    # Else open() waits half a second for peers that are not up.
+    # Otherwise open() waits half a second for absent peers.
     "open/return_conditions/connect_scouted": False,
     "transport/link/tx/keep_alive": 4,
     # A full queue drops at once: a stopped subscriber costs the publisher nothing.
@@ -79,10 +80,8 @@ _PRIORITIES: Final = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
-_BATCH_MAX: Final = 64
-"""Maximum number of messages in a batch that no message closes."""
 _RECORDING_WAITS_S: Final = 16.0
-"""Capacity for messages that wait for a slow disk, s at their rate: 60 MB for the fleet."""
+"""Capacity for messages while the disk is slow, s at their nominal rate: 60 MB for the fleet."""
 _ALIVE_TIMEOUT_S: Final = 0.2
 _TOOLS_MAX: Final = 128
 """Maximum number of named tools, equal to the maximum number of links."""
@@ -94,9 +93,9 @@ _TOOLS_AT_ONCE: Final = 64
 def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
     """Return the services that a process dials; all its other peers dial it.
 
-    Each pair is linked once. Joint services dial nobody: they exchange nothing with each other, and
-    the tier that must outlive the others spends no time on absent peers. Each other service dials
-    the joints and the services before it in `services`; a tool dials all.
+    Each pair is linked once. Joint services dial no peer: they exchange nothing with each other,
+    and this tier, which must outlive the others, spends no time on absent peers. Each other service
+    dials the joint services and the services before it in `services`; a tool dials all.
     """
     if name in MODULES:
         return ()
@@ -106,196 +105,20 @@ def peers_of(name: str, services: Sequence[str] = SERVICES) -> tuple[str, ...]:
     return (*MODULES, *central[: central.index(name)])
 
 
-class _BatchSender:
-    """Second copy of a service's messages for the recorder, many messages at a time.
-
-    If the recorder subscribed to each key, each message would wake it, and Zenoh's thread at both
-    ends.
-    """
-
-    def __init__(self, put: _Put) -> None:
-        self._put = put
-        self._seq = 0
-        self._messages: list[tuple[str, msgspec.Raw]] = []
-
-    def also(self, key: str, put: _Put, *, closes: bool) -> _Put:
-        """Return a `put` of one key that also adds the payload to the batch.
-
-        A payload that closes the batch sends it.
-        """
-        messages = self._messages
-
-        def put_and_add(payload: bytes) -> None:
-            put(payload)
-            messages.append((key, msgspec.Raw(payload)))
-            if closes or len(messages) == _BATCH_MAX:
-                self.send()
-
-        return put_and_add
-
-    def send(self) -> None:
-        """Send the collected messages, if any."""
-        if self._messages:
-            self._seq += 1
-            batch = Batch(t_ns=now_ns(), seq=self._seq, messages=tuple(self._messages))
-            self._messages.clear()
-            self._put(encode(batch))
-
-
-class Publisher(Generic[T]):
-    """Publisher of one key."""
-
-    def __init__(
-        self, publisher: zenoh.Publisher, encoded: Callable[[T], bytes], put: _Put | None = None
-    ) -> None:
-        self._publisher, self._put, self._encoded = publisher, put or publisher.put, encoded
-        self.failed = 0
-        """Messages that were not sent: a value cannot be encoded, or the session is closed."""
-        self._has_reported = False
-
-    def put(self, message: T) -> bool:
-        """Send a message; return False and count it if it cannot be sent.
-
-        Never blocks and never raises. If a subscriber's queue is full, the message is dropped for
-        that subscriber only and not counted. A message that cannot be encoded is a bug of the
-        sender. A thread logs the first one with its field, because a log line may block.
-        """
-        try:
-            self._put(self._encoded(message))
-        except zenoh.ZError:
-            self.failed += 1
-            return False
-        except EncodeError as error:
-            self.failed += 1
-            if not self._has_reported:
-                self._has_reported = True
-                line = ("%s", str(error))
-                threading.Thread(target=log.get("xrl").error, args=line, daemon=True).start()
-            return False
-        return True
-
-
-class RawPublisher(Publisher[bytes]):
-    """Publisher of encoded payloads on one key: for log playback, never for a service."""
-
-    def __init__(self, publisher: zenoh.Publisher) -> None:
-        super().__init__(publisher, bytes)
-
-    @property
-    def matched(self) -> bool:
-        """True if the key has a subscriber; for display."""
-        try:
-            return bool(self._publisher.matching_status.matching)  # type: ignore[attr-defined]  # zenoh's stub
-        except zenoh.ZError:
-            return False
-
-
-class Latest(Generic[M]):
-    """Newest message of one key."""
-
-    def __init__(self, subscriber: _Subscriber, message_type: type[M]) -> None:
-        self._subscriber = subscriber  # dropping it would end the subscription
-        self._try_recv = subscriber.handler.try_recv
-        self._decoder = Decoder(message_type)
-
-    @property
-    def refused(self) -> int:
-        """Payloads that were not a message of this type, or held a number that is not finite."""
-        return self._decoder.refused
-
-    def take(self) -> M | None:
-        """Return the newest message if it was not taken before, else None; never blocks.
-
-        A payload that cannot be decoded is counted in `refused` and gives None.
-        """
-        sample = self._try_recv()
-        if sample is None:
-            return None
-        return self._decoder.decode(sample.payload.to_bytes())
-
-
-class LatestInBatch(Latest[M]):
-    """Newest message of one key, from the recorder's batches."""
-
-    def __init__(self, batches: _Subscriber, key: str, message_type: type[M]) -> None:
-        super().__init__(batches, message_type)
-        self._key, self._batches = key, Decoder(Batch)
-
-    def take(self) -> M | None:
-        """Return the newest message of the newest batch if it was not taken before, else None."""
-        sample = self._try_recv()
-        batch = None if sample is None else self._batches.decode(sample.payload.to_bytes())
-        for key, payload in reversed(() if batch is None else batch.messages):
-            if key == self._key:
-                return self._decoder.decode(bytes(payload))
-        return None
-
-
-class Stream:
-    """Undecoded samples of some keys, for the recorder and for tools."""
-
-    def __init__(self, subscribers: Sequence[_Subscriber]) -> None:
-        self._subscribers = deque(subscribers)
-
-    def take(self) -> tuple[str, bytes, int] | None:
-        """Return (key, payload, time in monotonic ns) of the oldest sample, or None.
-
-        The time is that of this call, not of the arrival. Order holds within one key expression.
-        Never blocks. A full buffer drops its oldest samples; the messages' sequence numbers show
-        the loss.
-        """
-        for _ in range(len(self._subscribers)):
-            self._subscribers.rotate(-1)  # in turns, so that no busy key starves another
-            sample = self._subscribers[0].try_recv()
-            if sample is not None:
-                return str(sample.key_expr), sample.payload.to_bytes(), now_ns()
-        return None
-
-
-class Recording(Stream):
-    """Undecoded recorded messages, taken out of their batches."""
-
-    def __init__(
-        self, subscribers: Sequence[_Subscriber], keys_by_batch: Mapping[str, Container[str]]
-    ) -> None:
-        """Take the subscribers and, by batch key, the keys that its batches may contain."""
-        super().__init__(subscribers)
-        self._keys_by_batch = keys_by_batch
-        self._decoder = Decoder(Batch)
-        self._waiting: deque[tuple[str, bytes]] = deque()
-
-    def take(self) -> tuple[str, bytes, int] | None:
-        """Return (key, payload, time in monotonic ns) of the oldest message, or None.
-
-        A message that the batch's sender may not put is dropped. A malformed batch is returned as
-        it is, and the recorder counts its key as unknown.
-        """
-        while not self._waiting:
-            sample = super().take()
-            if sample is None or sample[0] not in self._keys_by_batch:
-                return sample
-            allowed = self._keys_by_batch[sample[0]]
-            batch = self._decoder.decode(sample[1])
-            if batch is None:
-                return sample
-            self._waiting.extend((k, bytes(raw)) for k, raw in batch.messages if k in allowed)
-        return *self._waiting.popleft(), now_ns()
-
-
 def place_of_tool() -> str:
-    """Return HOST.PID of this process, as its token has it."""
+    """Return HOST.PID of this process, for its liveliness token."""
     return f"{re.sub('[^A-Za-z0-9-]', '-', socket.gethostname())}.{os.getpid()}"
 
 
 class LinkedTools:
-    """Tools linked with this process, by the names that they chose."""
+    """Tools linked with this process."""
 
-    def __init__(self, subscriber: _Subscriber) -> None:
+    def __init__(self, subscriber: Subscriber) -> None:
         self._subscriber = subscriber
         self._names: set[str] = set()
 
     def names(self) -> tuple[str, ...]:
-        """Return each as NAME.HOST.PID; never blocks, however many come and go."""
+        """Return each tool as NAME.HOST.PID; never blocks."""
         for _ in range(_TOOLS_AT_ONCE):
             sample = self._subscriber.try_recv()
             if sample is None:
@@ -318,7 +141,7 @@ class Session:
         self.name = name
         self._session = session
         self._alive_prefix = f"{alive_prefix(robot)}/"
-        self._batches: dict[str, _BatchSender] = {}
+        self._batches: dict[str, BatchSender] = {}
         self._token = session.liveliness().declare_token(token_key(robot, name, place_of_tool()))
         if over_tcp:  # the reference keeps it alive
             self._links = session.info.declare_link_events_listener(self._meet, history=True)
@@ -343,20 +166,21 @@ class Session:
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
     def publisher(self, topic: Topic, message_type: type[M], module: str = "") -> Publisher[M]:
-        """Declare a publisher; do it at the start, not in a loop.
+        """Declare a publisher; call this at start-up, not in a loop.
 
         `module` is for a topic with one key per module. Raises BusError if the type or the module
         does not fit the topic.
         """
         key = self._key(topic, message_type, module)
         publisher = self._declare(topic, key)
+        put = addressed(publisher)
         if topic.batch is None:
-            return Publisher(publisher, encode)
+            return Publisher(publisher, encode, put)
         batch_key = topic.batch.key(self.robot, module)
         if batch_key not in self._batches:
-            self._batches[batch_key] = _BatchSender(self._declare(topic.batch, batch_key).put)
+            self._batches[batch_key] = BatchSender(addressed(self._declare(topic.batch, batch_key)))
         batch = self._batches[batch_key]
-        return Publisher(publisher, encode, batch.also(key, publisher.put, closes=topic.closes))
+        return Publisher(publisher, encode, batch.also(key, put, closes=topic.closes))
 
     def _declare(self, topic: Topic, key: str) -> zenoh.Publisher:
         return self._session.declare_publisher(
@@ -367,11 +191,12 @@ class Session:
         )
 
     def raw_publisher(self, key: str, *, patient: bool) -> RawPublisher:
-        """Declare a publisher of encoded payloads on any full key; BusError if it is malformed.
+        """Declare a publisher of encoded payloads on any full key.
 
-        All such publishers have the same priority, so payloads arrive in the order of `put`, over
-        all keys. With `patient`, `put` waits up to `wait_before_close` (5 s) for a slow subscriber,
-        and then drops the link instead of the message. Use it only if nothing waits for the caller.
+        Raises BusError if the key is malformed. All these publishers have the same priority, so
+        payloads arrive in the order of `put` across all keys. With `patient`, `put` waits up to
+        `wait_before_close` (5 s) for a slow subscriber, and then drops the link instead of the
+        message. Use it only if nothing waits for the caller.
         """
         control = zenoh.CongestionControl.BLOCK if patient else zenoh.CongestionControl.DROP
         try:
@@ -390,18 +215,19 @@ class Session:
     def latest_in_batch(
         self, topic: Topic, message_type: type[M], module: str = ""
     ) -> LatestInBatch[M]:
-        """Declare the same on the recorder's batches, which costs the service nothing."""
+        """Declare a subscriber as `latest` does, but on the batches: no cost to the service."""
         key = self._key(topic, message_type, module)
         if topic.batch is None:
-            raise BusError(f"{topic.name}: is not in a batch; use `latest`")
+            raise BusError(f"{topic.name} is not in a batch; use `latest`")
         batches = _ring(self._session, topic.batch.key(self.robot, module), 1)
         return LatestInBatch(batches, key, message_type)
 
     def stream(self, key_expressions: Sequence[str], capacity: int = 65536) -> Stream:
         """Declare a subscriber that keeps every sample, up to `capacity` per expression.
 
-        Expressions are full keys, or with wildcards such as `xrl/lab/joint/*/state`. A key that
-        matches two of them arrives twice. Raises BusError for a malformed one.
+        An expression is a full key, or has wildcards, such as `xrl/lab/joint/*/state`. A sample
+        whose key matches two expressions arrives twice. Raises BusError if an expression is
+        malformed.
         """
         try:
             return Stream([_ring(self._session, key, capacity) for key in key_expressions])
@@ -419,7 +245,7 @@ class Session:
         )
 
     def alive(self) -> set[str]:
-        """Return the services linked with this process, and itself if it is a service.
+        """Return the services linked with this process, including itself if it is a service.
 
         For display only: a stopped process counts as alive until its lease is over. Takes up to
         0.2 s; not for a control loop.
@@ -442,10 +268,10 @@ class Session:
 
     @staticmethod
     def _meet(event: zenoh.LinkEvent) -> None:
-        """Make a TCP link close by a reset.
+        """Make a TCP link close with a reset.
 
-        Zenoh sets SO_LINGER to 10 s and closes from its only thread. After a cable was cut for
-        longer than the lease, all links stalled for up to 10 s for each lost link.
+        Zenoh sets SO_LINGER to 10 s and closes links in its only thread. After a cable was cut for
+        longer than the lease, each lost link stalled all links for up to 10 s.
         """
         here, there = event.link.src, event.link.dst
         if event.kind == zenoh.SampleKind.PUT and here.startswith(security.TCP):
@@ -461,7 +287,7 @@ class Session:
             right = ", ".join(MODULES)
             raise BusError(f"{topic.name}: {module!r} is not a valid module; use one of {right}")
         if module and not topic.per_module:
-            raise BusError(f"{topic.name}: has no key for {module}; omit the module")
+            raise BusError(f"{topic.name} has no key per module; omit the module")
         return topic.key(self.robot, module)
 
 
@@ -479,22 +305,22 @@ def open_session(
 
     Use it as `with open_session(config, "planner", run_dir) as session:`. Raise the priority of the
     process first: Zenoh's thread inherits it. From this call on, the process uses the clock of the
-    fleet in `run_dir` (`shared.clock.keep_pace`). A socket left behind by a killed process is no
-    obstacle.
+    fleet in `run_dir` (`shared.clock.keep_pace`). A socket that a killed process left behind does
+    no harm.
 
     Args:
         config: the robot; `config.bus` holds the endpoints and the lease.
         name: a service of `robot_config.SERVICES`, which listens on its endpoint, or any other
-            name (letters, digits, _ and -) for a tool, which listens nowhere.
-        run_dir: replaces `{run}` in endpoints; created if missing.
-        listen: further endpoints to listen on, by which a tool serves other tools.
-        connect: further endpoints to dial: those of such a tool.
+            name (letters, digits, _ and -) for a tool, which listens only on `listen`.
+        run_dir: run directory, whose live directory replaces `{run}` in endpoints.
+        listen: further endpoints to listen on, for a tool that serves other tools.
+        connect: further endpoints to dial, such as those of a tool that serves others.
         only: services to dial; None: all peers of this process.
         injected: dial through the network proxy on the links that it serves
             (`shared.links.PAIRS`).
 
     Raises:
-        BusError: the name is not allowed, or the endpoint is in use, too long or invalid.
+        BusError: the name is not allowed, or an endpoint is in use, too long or invalid.
     """
     keep_pace(run_dir)
     if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
@@ -542,7 +368,7 @@ def open_session(
     return session
 
 
-def _ring(session: zenoh.Session, key: str, capacity: int) -> _Subscriber:
+def _ring(session: zenoh.Session, key: str, capacity: int) -> Subscriber:
     """Subscribe without a callback: a full ring drops its oldest and delays no other key."""
     return session.declare_subscriber(key, zenoh.handlers.RingChannel(capacity))
 

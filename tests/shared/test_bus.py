@@ -17,7 +17,8 @@ from shared import run_directory
 from shared.bus import topics
 from shared.bus.codec import encode
 from shared.bus.messages import Estop, JointCommand, JointEvent, JointState, Wrench
-from shared.bus.session import Latest, Publisher, Session, open_session
+from shared.bus.pubsub import Latest, Publisher
+from shared.bus.session import Session, open_session
 from shared.bus.traces import Batch, JointTrace
 from shared.config import files as config_file
 from shared.exceptions import BusError
@@ -260,9 +261,22 @@ def test_message_that_is_none_is_refused_and_counted_by_the_receiver(
     ankle: Ankle, bad: bytes
 ) -> None:
     planner, publisher, commands = ankle
-    planner._session.put(topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right"), bad)
+    key = topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right")
+    planner._session.put(key, bad, attachment=key.encode())
     assert comes_true(lambda: commands.take() is None and commands.refused == 1)
     assert comes_true(lambda: publisher.put(command(2)) and commands.take())
+
+
+@pytest.mark.parametrize("sent_to", ["ankle_left", None])
+def test_a_command_that_zenoh_delivers_under_another_modules_key_is_refused_and_counted(
+    ankle: Ankle, sent_to: str | None
+) -> None:
+    planner, publisher, commands = ankle
+    sent = sent_to and topics.JOINT_COMMAND.key(ROBOT.name, sent_to).encode()
+    came_as = topics.JOINT_COMMAND.key(ROBOT.name, "ankle_right")
+    planner._session.put(came_as, encode(command(7)), attachment=sent)
+    assert comes_true(lambda: commands.take() is None and commands.refused == 1)
+    assert comes_true(lambda: publisher.put(command(8)) and commands.take())
 
 
 def test_a_second_process_of_a_name_learns_that_the_endpoint_is_in_use(
@@ -318,7 +332,7 @@ class Recorded:
         self.traces = joint.publisher(topics.JOINT_TRACE, JointTrace, MODULE)
         self.batches = joint.publisher(topics.JOINT_BATCH, Batch, MODULE)
         self.shown = tool.latest_in_batch(topics.JOINT_STATE, JointState, MODULE)
-        self._recording = recorder.recording()
+        self.joint, self.recording = joint, recorder.recording()
         self.taken: list[tuple[str, int]] = []
         assert comes_true(lambda: self.traces.put(sample(JointTrace, seq=0)) and self.take())
         time.sleep(0.2)  # what was under way has come
@@ -326,7 +340,7 @@ class Recorded:
         self.taken.clear()
 
     def take(self) -> int:
-        for key, payload, _ in iter(self._recording.take, None):
+        for key, payload, _ in iter(self.recording.take, None):
             number = msgspec.json.decode(payload)["seq"]
             self.taken.append((key.rpartition("/")[2], number))
         return len(self.taken)
@@ -369,6 +383,16 @@ def test_a_batch_brings_nothing_that_its_sender_may_not_put(recorded: Recorded) 
     time.sleep(0.1)
     recorded.take()
     assert recorded.taken == [("state", 7)]
+
+
+def test_a_message_delivered_under_another_key_is_neither_recorded_nor_shown(
+    recorded: Recorded,
+) -> None:
+    batch = Batch(t_ns=1, seq=1, messages=())
+    sent, came_as = (topics.JOINT_BATCH.key(ROBOT.name, m) for m in ("knee_right", MODULE))
+    recorded.joint._session.put(came_as, encode(batch), attachment=sent.encode())
+    assert comes_true(lambda: recorded.take() == 0 and recorded.recording.misdelivered == 1)
+    assert comes_true(lambda: recorded.shown.take() is None and recorded.shown.refused == 1)
 
 
 def test_behind_a_slow_disk_a_bounded_number_of_batches_waits(recorded: Recorded) -> None:

@@ -116,7 +116,7 @@ def test_a_peer_is_heard_on_its_own_keys_and_on_no_other(bus: Bus, name: str) ->
 
         def put_all() -> set[str]:
             for key in keys:
-                peer.put(key, b"{}")
+                peer.put(key, b"{}", attachment=key.encode())
             heard.update(key for key, _, _ in iter(ear.take, None))
             return heard
 
@@ -218,10 +218,11 @@ def test_a_revoked_certificate_links_and_is_not_heard(bus: Bus, tmp_path: Path) 
         ear = recorder.stream([f"xrl/{ROBOT.name}/**"])
         assert comes_true(lambda: linked(lost) and linked(now))
         heard: set[bytes] = set()
+        key = f"xrl/{ROBOT.name}/planner/status"
 
         def put_both() -> set[bytes]:
-            lost.put(f"xrl/{ROBOT.name}/planner/status", b"lost")
-            now.put(f"xrl/{ROBOT.name}/planner/status", b"now")
+            for session, word in ((lost, b"lost"), (now, b"now")):
+                session.put(key, word, attachment=key.encode())
             heard.update(payload for _, payload, _ in iter(ear.take, None))
             return heard
 

@@ -58,7 +58,8 @@ def steadily(work: Callable[[], object], per_s: int = PER_S) -> Iterator[None]:
 def messages(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
     """Put messages that are right in every way, on a key that an operator may use."""
     session = link(robot, run_dir)
-    publisher = session.declare_publisher(f"xrl/{robot.name}/run/event")
+    key = f"xrl/{robot.name}/run/event"
+    publisher = session.declare_publisher(key)
     seq = itertools.count()
 
     def put() -> None:
@@ -73,7 +74,8 @@ def messages(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
                     detail=words,
                     scenario_s=0.0,
                 )
-            )
+            ),
+            attachment=key.encode(),
         )
 
     yield from steadily(put)

@@ -31,6 +31,7 @@ class Queue:
 
     def __init__(self, items: Iterable[tuple[str, bytes, int]] = ()) -> None:
         self.items = deque(items)
+        self.misdelivered = 0
 
     def take(self) -> tuple[str, bytes, int] | None:
         return self.items.popleft() if self.items else None
