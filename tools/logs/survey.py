@@ -1,4 +1,4 @@
-"""Counts the contents of MCAP files by file and by topic, finished or not, ours or foreign."""
+"""Count the contents of MCAP files by file and by topic, even of unfinished and foreign files."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class TopicFacts(msgspec.Struct, kw_only=True):
 
     schema: str
     nominal_hz: float
-    """Rate in the table of topics at the recording; 0 for events, or if unknown."""
+    """Rate in the recorder's table of topics; 0 for events, or if unknown."""
     bytes: int | None = 0
-    """Size of the payload before compression, bytes; None if not read."""
+    """Total size of the payloads before compression, bytes; None if not read."""
     first_ns: int = _NEVER
     last_ns: int = _NEVER
     longest_gap_ns: int | None = 0
-    """Longest time between consecutive messages, by the sender's clock in our logs, or None."""
+    """Longest gap between consecutive messages (our logs: sender's clock); None if not read."""
     sequence: KeyCount = msgspec.field(default_factory=KeyCount)
 
     @property
     def rate_hz(self) -> float | None:
-        """Return the mean rate from the first to the last message."""
+        """Mean rate from the first to the last message."""
         span_ns = self.last_ns - self.first_ns
         return (self.sequence.count - 1) * NS_PER_S / span_ns if span_ns > 0 else None
 
@@ -54,25 +54,25 @@ class FileFacts(msgspec.Struct, kw_only=True):
     library: str = ""
     messages: int = 0
     first_ns: int = _NEVER
-    """Log times; -1 without messages."""
+    """Log time of the first message; -1 without messages."""
     last_ns: int = _NEVER
     orphans: int = 0
-    """Messages of channels without a description."""
+    """Number of messages whose channel the file does not describe."""
     passed_over: int = 0
-    """Records of kinds that the format does not define."""
+    """Number of records of kinds that the format does not define."""
     attachments: dict[str, int] = msgspec.field(default_factory=dict)
     """Sizes by name."""
     metadata: MetadataByName = msgspec.field(default_factory=dict)
     counted: int | None = None
-    """Number of messages in its summary; None without one, or if it is damaged."""
+    """Number of messages according to the summary; None if it is missing or damaged."""
     earlier_ends: int = 0
-    """Ends in the middle of the file, which its writer finished more than once."""
+    """Number of file ends with data after them: the writer finished the file more than once."""
     cut: LostBytes | None = None
     damage: list[LostBytes] = msgspec.field(default_factory=list)
 
     @property
     def ours(self) -> bool:
-        """Return True for a log of this project, of any version."""
+        """True for a log of this project, of any version."""
         return self.profile == PROFILE
 
 
@@ -99,9 +99,10 @@ class Survey:
         return max((f.last_ns for f in self.files if f.messages), default=_NEVER)
 
     def add(self, path: Path, *, by_index: bool = False) -> FileFacts:
-        """Read a file. With `by_index`, use the recorder's own counts in a finished file of ours.
+        """Read a file; with `by_index`, use the recorder's counts in our finished logs.
 
-        Those are exact to within a chunk, and find no damage.
+        With those counts, a topic's times are exact to within a chunk, and damage is not searched
+        for.
         """
         for take in (_Reading.skim, _Reading.read) if by_index else (_Reading.read,):
             with open_log(path) as reader:
@@ -114,6 +115,9 @@ class Survey:
                 facts.counted = reader.message_count
             if taken:
                 break
+        if not facts.ours:  # other writers number messages as they like; rosbags writes only 0
+            for topic in self.topics.values():
+                topic.sequence = KeyCount(count=topic.sequence.count, several=True)
         self.files.append(facts)
         return facts
 
@@ -136,7 +140,7 @@ class _Reading:
         return True
 
     def skim(self, reader: LogReader) -> bool:
-        """Use the recorder's own counts; return False if they are missing or do not fit."""
+        """Use the recorder's counts; return False if they are missing or do not fit."""
         places: list[ChunkPlace] = []
         others: list[McapRecord] = []
         for found in reader.skim():
@@ -194,7 +198,6 @@ class _Reading:
         self._channels[channel.id] = self._topics.setdefault(channel.topic, facts)
 
     def _count(self, record: LogRecord) -> None:
-        """Count the messages of a chunk (the hot loop)."""
         file, channels, ours = self._facts, self._channels, self._facts.ours
         for channel, seq, log_ns, publish_ns, start, end in record.rows:
             topic = channels.get(channel)

@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -151,6 +152,22 @@ def foreign(path: Path) -> None:
         writer.add_message(channel, 10**18, b"\0\1", 10**18, 1)
         writer.add_message(channel, 2**64 - 1, b"\0\1", 0, 2)
         writer.finish()
+
+
+def test_other_writers_sequence_numbers_show_neither_losses_nor_restarts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        channel = writer.register_channel("/odom", "cdr", 0)
+        for number, sequence in enumerate((0, 0, 5)):
+            writer.add_message(channel, number, b"\0\1", number, sequence)
+        writer.finish()
+    assert cli.main(["log", "info", str(path), "--json"]) == 0
+    counts = msgspec.json.decode(capsys.readouterr().out)["topics"]["/odom"]["sequence"]
+    assert (counts["count"], counts["missing"], counts["restarts"]) == (3, 0, 0)
 
 
 @pytest.mark.parametrize("make", [old_version, foreign])

@@ -141,7 +141,7 @@ def test_a_slow_topic_stands_beside_its_rate_and_an_event_has_none(
     (row,) = [line.split() for line in output.splitlines() if "harness/wrench" in line]
     assert row == ["harness/wrench", "11", "100.0", "250", "10.0", "0", "0"]
     (row,) = [line.split() for line in output.splitlines() if "run/event" in line]
-    assert row == ["run/event", "3", "0", "0"]
+    assert row == ["run/event", "3"], "several may send it: its losses are unknown"
 
 
 def test_an_injection_is_reported_with_its_counts(

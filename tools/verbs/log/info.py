@@ -32,17 +32,16 @@ from tools.logs.survey import FileFacts, Survey, TopicFacts
 from tools.terminal import Console, marked
 
 SLOW: Final = 0.9
-"""Fraction of a topic's nominal rate below which it is marked."""
+"""A rate below this fraction of the topic's nominal rate is marked."""
 MIB: Final = 1 << 20
 LARGE: Final = 128 * MIB
-"""Larger finished files are not read completely, bytes."""
+"""Size above which finished files are read completely only with --full, bytes."""
 INJECTED_MAX: Final = 12
 """Maximum number of impairments listed."""
 
 
 EXAMPLES: Final = """
 xrl log info out/a/run.mcap
-xrl log info out/a/run.mcap --run
 xrl log info out/a/run.mcap --json | jq '.topics | map_values(.sequence.missing)'
 """
 
@@ -57,12 +56,12 @@ class InfoFlags(Flags):
     full: Annotated[
         bool,
         Arg(
-            help=f"read every message, even of a finished file over {LARGE >> 20} MiB, for sizes, "
-            "longest gaps and damage; without this flag the recorder's counts are shown"
+            help=f"read every message of a finished file over {LARGE >> 20} MiB, for sizes, "
+            "longest gaps and damage (default: the recorder's counts)"
         ),
     ] = False
     json: bool = False
-    """print the survey as JSON"""
+    """print JSON"""
 
 
 def run(flags: InfoFlags) -> int:
@@ -129,7 +128,7 @@ def _show_file(file: FileFacts, console: Console) -> None:
     flush_ms = file.metadata.get("recorder", {}).get("flush_ms", "")
     if not file.finished and not file.in_use:
         if flush_ms:
-            console.print(f"  written every {printable(flush_ms)} ms: anything later is missing")
+            console.print(f"  written every {printable(flush_ms)} ms: later messages are missing")
         command = f"xrl log recover {printable(shlex.quote(str(file.path)))}"
         console.print(f"  finish it with: {command}", soft_wrap=True)
     elif lines and not file.in_use:
@@ -201,13 +200,13 @@ def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
     """Return a row for each topic."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("topic", overflow="fold")
-    for name in ("count", "Hz", "of Hz", "gap ms", "lost", "restarts"):
+    for name in ("count", "Hz", "nominal", "gap ms", "lost", "restarts"):
         table.add_column(name, justify="right", no_wrap=True)
     for name, topic in sorted(found.items()):
         rate, nominal = topic.rate_hz, topic.nominal_hz
         slow = rate is not None and nominal > 0.0 and rate < SLOW * nominal
         steady = rate is not None and (nominal > 0.0 or not events)
-        lost = topic.sequence.missing
+        lost, known = topic.sequence.missing, not topic.sequence.several
         table.add_row(
             printable(name.removeprefix(prefix)),
             str(topic.sequence.count),
@@ -216,8 +215,8 @@ def _table(found: dict[str, TopicFacts], prefix: str, *, events: bool) -> Table:
             f"{topic.longest_gap_ns * 1e-6:.1f}"
             if steady and topic.longest_gap_ns is not None
             else "",
-            Text(str(lost), style="yellow" if lost else ""),
-            str(topic.sequence.restarts),
+            Text(str(lost) if known else "", style="yellow" if lost else ""),
+            str(topic.sequence.restarts) if known else "",
         )
     return table
 
