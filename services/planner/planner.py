@@ -7,7 +7,8 @@ log.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -53,8 +54,11 @@ LATE_FRACTION = 1.25
 TICK_GAP_MAX_S = 0.02
 """Maximum integration step, s; a longer gap between ticks means a stopped process."""
 
+_DECIMALS: Final = 7
+"""Decimals of lengths, angles, rates, torques and gains in messages, SI units. No sensor or motor
+resolves 1e-7, and a double's further digits would fill a sixth of the log."""
 _ALL_NEW = (1 << N_MODULES) - 1
-# Compared in each tick: docs/contributing.md, The control path.
+# Constants, because each tick compares them (docs/contributing.md, The control path).
 _CARRIES = (int(Mode.HOLD), int(Mode.TRACK))
 _WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
 
@@ -107,7 +111,7 @@ class Inputs(NamedTuple):
     states: list[JointState]
     """Newest state of each module, of any age."""
     fresh: list[bool]
-    """True if a module's state arrived within `planner.state_stale_ms`."""
+    """Per module, True if its state arrived within `planner.state_stale_ms`."""
     q: Array
     """(12,), rad"""
     v: Array
@@ -133,13 +137,13 @@ class _Ages(NamedTuple):
 
 
 class Planner:
-    """Whole-body law behind its engagement rule.
+    """The planner without I/O: the whole-body law, and the decision whether it leads.
 
     Attributes:
         session: number drawn at random at each start; sent in every command.
         state: everything that changes between ticks. A snapshot is a copy of it
-            (`shared.state.copied`), and another planner that gets the copy continues bit for bit.
-            A custom controller keeps its own state.
+            (`shared.state.copied`), from which another planner continues bit for bit. A custom
+            controller's own state is not part of it.
     """
 
     def __init__(
@@ -154,7 +158,7 @@ class Planner:
         """
         self.session = session
         self.state = PlannerState()
-        if controller is not None:  # an integral of the law would wind up against it
+        if controller is not None:  # else the integral winds up against it
             law = msgspec.structs.replace(config.law, push_integral_max=0.0)
             config = msgspec.structs.replace(config, law=law)
         self._law = Hocca(config)
@@ -183,7 +187,7 @@ class Planner:
 
     @property
     def compares_arrivals(self) -> bool:
-        """True if arrivals of the next states are compared (`services.planner.state_phases`)."""
+        """True if the next states' arrivals will be compared (`services.planner.state_phases`)."""
         return self._phases.compares(self.state.phases)
 
     def receive_state(self, module: int, state: JointState, now_ns: int) -> None:
@@ -220,8 +224,8 @@ class Planner:
         """Return True if a tick is due: as soon as all six modules have a new state.
 
         Low age matters, because in the open directions only fresh references cancel the local
-        gains. With its own timer, the planner would let states age by up to a period. It therefore
-        waits for the states and ticks at their rate, but waits only briefly for late ones.
+        gains. With its own timer, the planner would let states age by up to a period. So it waits
+        for the states and ticks at their rate, but waits only briefly for late ones.
         """
         since_s = (now_ns - self.state.last_ns) / NS_PER_S
         if self.state.new == _ALL_NEW:
@@ -288,7 +292,7 @@ class Planner:
         s, states = self.state, inputs.states
         recent = [state for state, fresh in zip(states, inputs.fresh, strict=True) if fresh]
         if s.rival.advance(self.session, recent, self._ages.command):
-            self.session += 1  # modules have retired this one
+            self.session += 1  # modules have retired this session
         s.engagement.advance(
             inputs.now_ns,
             inputs.fresh,
@@ -320,7 +324,7 @@ class Planner:
                 toward=self._toward(heat.toward),
                 released=(height or s.park.closed, pitch or s.park.closed),
                 pitch_drive=s.unattended.pitch.drive,
-                # until all engage, the law restarts from the measured pose, so nothing steps
+                # in HOLD, the law restarts from the measured pose, so engaging makes no step
                 align=s.engagement.hold,
                 wrench=inputs.wrench,
                 up_torso=inputs.up,
@@ -407,7 +411,7 @@ class Planner:
                 s.law.load, s.law.has_led, s.trust = LoadState(), False, HarnessTrust()
 
     def _announcement(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
-        """Return, at times, commands that every module refuses because their echo is too old."""
+        """Return, if due, commands that every module refuses because their echo is too old."""
         if not self.state.rival.announces(inputs.now_ns):
             return []
         earlier_ns = 2 * self._ages.command
@@ -433,7 +437,8 @@ class Planner:
             output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
             local.D, local.D_B,
         )  # fmt: skip
-        pairs = [list(zip(row[::2], row[1::2], strict=True)) for row in map(_listed, arrays)]
+        rows = _rounded(arrays).tolist()
+        pairs = [list(zip(row[::2], row[1::2], strict=True)) for row in rows]
         return [
             JointCommand(
                 t_ns=inputs.now_ns,
@@ -460,7 +465,7 @@ class Planner:
         ]
 
     def _toward(self, heat: Toward) -> Toward:
-        """Return where the robot moves on its own; heat takes precedence."""
+        """Return the direction in which the robot moves on its own; heat takes precedence."""
         return Toward.DOWN if heat is Toward.PERSON and self._sits else heat
 
     @property
@@ -522,7 +527,7 @@ class Planner:
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
             vectors = output.p, output.pdot, output.p_ref, output.closure
-            p, pdot, p_ref, closure = map(vector6, vectors)
+            p, pdot, p_ref, closure = map(vector6, _rounded(vectors))
             stance = output.stance
         return PlannerStatus(
             t_ns=now_ns,
@@ -565,6 +570,7 @@ class Planner:
         )
 
 
-def _listed(values: Array) -> list[float]:
-    numbers: list[float] = values.tolist()
-    return numbers
+def _rounded(vectors: Sequence[Array]) -> Array:
+    """Return the vectors as rows, rounded to what a sensor or a motor could resolve."""
+    rows: Array = np.concatenate(vectors).round(_DECIMALS).reshape(len(vectors), -1)
+    return rows
