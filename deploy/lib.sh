@@ -1,27 +1,27 @@
-# Sourced by the scripts beside it: sets `root` and, through `environment`, makes `.venv`.
-# Needs a Python that the lock was tried with (and its venv module, or uv), flock and sha256sum, and
-# libgomp; everything else comes with pip.
+# Sourced by the scripts in this folder. Sets `root`; the function `environment` makes `.venv`.
+# Needs a Python version in `tried` with its venv module (or uv), flock, sha256sum and libgomp. pip installs the
+# rest.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
 venv=$root/.venv
-stamp=$venv/xrl.stamp       # what the environment was made from; absent while it is being made
-kind=$venv/xrl.kind         # full or runtime, as it was asked for last
-half_made=$venv/xrl.making  # stands from the first to the last step of making it
-graphs=$venv/xrl-graphs/stamp  # what the law's graphs were translated into C from, where cc is
+stamp=$venv/xrl.stamp       # fingerprint of the environment's sources; missing while the environment is made
+kind=$venv/xrl.kind         # kind of the environment: full or runtime, as last requested
+half_made=$venv/xrl.making  # exists while the environment is made
+graphs=$venv/xrl-graphs/stamp  # fingerprint of the sources of the graphs in C
 
-# A fleet is ten processes, the tests start hundreds: without it each compiles all it imports, 0.8 s.
+# Let Python cache bytecode: otherwise each process compiles its imports for 0.8 s. A fleet has ten processes.
 unset PYTHONDONTWRITEBYTECODE
 
 say() { printf '%s\n' "deploy: $*" >&2; }
-die() { say "$*"; exit 2; }  # 1 is a robot that fell
+die() { say "$*"; exit 2; }  # exit code 1 means that the robot fell
 
-tried="3.14 3.13 3.12 3.11"  # Pythons that the lock files were tried with, the preferred one first
+tried="3.14 3.13 3.12 3.11"  # Python versions that the lock files were tested with, preferred first
 
 full=$root/requirements.lock
-runtime=$root/requirements.runtime.lock  # what a robot in service needs
-robot_extras="ros2 usb"  # what only some robots need; requirements.NAME.lock adds it to the runtime's
+runtime=$root/requirements.runtime.lock  # for a robot in service
+robot_extras="ros2 usb"  # for some robots; requirements.NAME.lock adds their packages to the runtime environment
 
-# The environment is right while this stays the same; scripts in it hold its absolute path.
+# Print a fingerprint of the environment's sources and of its path, which its scripts contain.
 fingerprint() {  # LOCK
   { printf '%s\n' "$root"; cat "$1" "$root/pyproject.toml"; } | sha256sum
 }
@@ -30,7 +30,7 @@ is_made_from() {  # LOCK
   [ -x "$venv/bin/python" ] && [ "$(cat "$stamp" 2>/dev/null)" = "$(fingerprint "$1")" ]
 }
 
-is_current() {  # full, runtime, or any: as it is
+is_current() {  # full, runtime or any
   case "$1" in
     full) is_made_from "$full" ;;
     runtime) is_made_from "$runtime" ;;
@@ -38,9 +38,9 @@ is_current() {  # full, runtime, or any: as it is
   esac
 }
 
-# Prints a Python's version and the time of a loop in it, us; nothing if it cannot make an environment.
-# Builds of one version differ: one with profile-guided optimisation is up to a quarter faster, and
-# no build says reliably whether it is one.
+# Print the version of a Python and the time of a loop in it, us, or nothing if it cannot make an environment.
+# The loop is timed because builds of one version differ: profile-guided optimisation makes a build up to a
+# quarter faster, but builds do not report it reliably.
 measure_python() {  # PYTHON
   "$1" -c '
 import sys, time, venv, ensurepip
@@ -52,9 +52,9 @@ def loop():
 print("%d.%d" % sys.version_info[:2], min(loop() for _ in range(9)) // 1000)' 2>/dev/null
 }
 
-# The newest Python that the lock was tried with, of those that can make an environment; of several
-# builds the first on PATH, unless another is clearly faster. Not the first of a name only: a version
-# manager's shim may stand before the real one.
+# Print the newest Python of `tried` that can make an environment. Among builds of one version, print the first on
+# PATH, unless another is over 5 % faster. All matches on PATH are tested, because a version manager's shim may
+# come before the real Python.
 find_python() {
   local version candidate found us best best_us
   for version in $tried; do
@@ -63,7 +63,7 @@ find_python() {
       read -r found us < <(measure_python "$candidate") || continue
       [ "$found" = "$version" ] || continue
       if [ -z "$best" ] || [ "$us" -lt $((best_us * 95 / 100)) ]; then
-        [ -z "$best" ] || say "$candidate takes $us us for a loop, $best $best_us us"
+        [ -z "$best" ] || say "a test loop takes $us us with $candidate, $best_us us with $best"
         best=$candidate best_us=$us
       fi
     done < <(type -aP "python$version" python3 python)
@@ -78,11 +78,11 @@ find_python() {
 no_python() {
   local found
   found=$(python3 --version 2>/dev/null) || found="no python3"
-  die "no Python of $tried with its venv module on PATH ($found); install it, for example by" \
+  die "none of Python $tried with its venv module is on PATH ($found); install one, for example by" \
     "$(how_to_install "python3-venv" "python3")"
 }
 
-# The command that brings a package of the system: Debian's name, Fedora's name.
+# Print how to install a system package, given its names on Debian and on Fedora.
 how_to_install() {
   if command -v apt-get >/dev/null; then printf '%s\n' "'apt-get install $1'"
   elif command -v dnf >/dev/null; then printf '%s\n' "'dnf install $2'"
@@ -90,11 +90,11 @@ how_to_install() {
   fi
 }
 
-# Wheels bring all but one library of the system. Without it the first import would be a traceback.
-# (Drives over USB want libusb-1.0 as well; who uses them is told so, shared/extras.py.)
+# Wheels contain every system library except libgomp, without which the first import fails with a traceback.
+# (Drives over USB also need libusb-1.0, which shared/extras.py checks.)
 check_libraries() {  # PYTHON
   "$1" -c 'import ctypes; ctypes.CDLL("libgomp.so.1")' 2>/dev/null ||
-    die "the library libgomp.so.1 is missing, which Pinocchio needs; install it:" \
+    die "libgomp.so.1 is missing, which Pinocchio needs; install it with" \
       "$(how_to_install libgomp1 libgomp)"
 }
 
@@ -117,26 +117,26 @@ make_venv() {
 }
 
 fresh_folder() {
-  mkdir -p "$venv" && : >"$half_made"  # the mark stands while what was there before goes
+  mkdir -p "$venv" && : >"$half_made"  # set the mark before the old files are deleted
   find "$venv" -mindepth 1 ! -path "$half_made" -delete
 }
 
 venv_is_sound() { [ ! -e "$half_made" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1; }
 
 make_environment() {  # LOCK
-  local lock=$1 compiled=--no-compile  # where it is first imported, 14 s of the 50 are saved
-  [ "$lock" != "$runtime" ] || compiled=--compile  # who runs it may not write there
+  local lock=$1 compiled=--no-compile  # compile at first import: saves 14 of 50 s
+  [ "$lock" != "$runtime" ] || compiled=--compile  # the services' user may not write there
   rm -f "$stamp"
-  if [ "$lock" = "$runtime" ] || ! venv_is_sound; then  # nothing else is left in a robot's
+  if [ "$lock" = "$runtime" ] || ! venv_is_sound; then  # a runtime environment has no other packages
     make_venv
   else
-    say "bringing .venv up to date"
+    say "updating .venv"
     : >"$half_made"
   fi
   "$venv/bin/python" -m pip install --quiet "$compiled" --require-hashes --only-binary :all: \
     --requirement "$lock" &&
     "$venv/bin/python" -m pip install --quiet --no-deps --no-build-isolation --editable "$root" ||
-    die "pip could not install the locked packages, see above; the next try starts afresh"
+    die "pip could not install the locked packages, see above; the next attempt starts from scratch"
   fingerprint "$lock" >"$stamp"
   rm -f "$half_made"
 }
@@ -149,7 +149,7 @@ add_extras() {  # NAME...
   done
 }
 
-# The graphs' C is right while this stays the same; a library also carries its graph's hash.
+# Print a fingerprint of the graphs' sources. Each library also contains the hash of its graph.
 graphs_fingerprint() {
   { command -v cc; cat "$stamp" "$root"/services/planner/law/{symbolic,model,certificate}.py \
     "$root"/services/simulator/physics/{body,actuation,plant}.py \
@@ -159,24 +159,24 @@ graphs_fingerprint() {
 
 graphs_are_current() { [ "$(cat "$graphs" 2>/dev/null)" = "$(graphs_fingerprint)" ]; }
 
-# Speed only: what cannot be translated is said, and CasADi interprets it.
+# Translate the graphs into C for speed. A failure is only reported, because CasADi can interpret the graphs.
 translate_graphs() {
   local from
   from=$(graphs_fingerprint)
   (cd "$root" && "$venv/bin/python" -m tools.graph_libraries && mkdir -p "${graphs%/*}" &&
-    printf '%s\n' "$from" >"$graphs") || say "the law's graphs stay interpreted: slower, else the same"
+    printf '%s\n' "$from" >"$graphs") || say "the law's graphs stay interpreted: slower, with the same results"
 }
 
-# After a `git pull` a robot's environment is a robot's again, whichever script makes it.
-kind_for() {  # full, runtime, or any: as it was
+# Print the kind of environment to make. With `any` it stays the same, so a `git pull` keeps a runtime environment.
+kind_for() {  # full, runtime or any
   local was
   was=$(cat "$kind" 2>/dev/null) || was=full
   [ "$1" = any ] && printf '%s\n' "$was" || printf '%s\n' "$1"
 }
 
-# Make `.venv` from the lock file, or do nothing, quickly, if it is right already.
-# Two at once: the second waits. Stopped in the middle: the next one starts afresh.
-environment() {  # [full | runtime]: either is right without
+# Make `.venv` from the lock file, or return at once if it is current. If another script is making it, wait. After
+# an interruption, the next script starts from scratch.
+environment() {  # [full | runtime], default: either
   local wanted=${1:-any} lock=$full made_as
   made_as=$(kind_for "$wanted")
   [ "$made_as" != runtime ] || lock=$runtime
@@ -192,7 +192,7 @@ environment() {  # [full | runtime]: either is right without
   exec 9<&-
 }
 
-# Become the verb of the command line: no shell stands between a Ctrl-C and the tool.
+# Replace this shell with `xrl`, which then receives Ctrl-C directly.
 xrl() {
   environment
   exec "$venv/bin/xrl" "$@"

@@ -1,8 +1,8 @@
-"""Learn a controller: a Gymnasium environment on lockstep, in the planner's place.
+"""Train a controller in a Gymnasium environment on lockstep.
 
-A step is 10 ms of virtual time. The action moves each joint's reference and adds to its coupled
-torque; zeros are the shipped law. Certificate, age rule and envelope stay in force: the joint
-services refuse a bad action, and the robot holds. Run it: python examples/gym_environment.py
+A step is 10 ms of virtual time. The action is added to each joint's reference and coupled torque; a
+zero action is the shipped law. Certificate, age rule and envelope stay active: the joint services
+refuse a bad action, and the robot holds. Run: python examples/gym_environment.py
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from shared.config.scenarios import load as load_scenario
 from shared.places import DEFAULT_CONFIG, SCENARIOS
 from tools.sim.lockstep import Lockstep, begin_standing
 
-OFFSET, TORQUE = 0.01, 20.0  # rad and N m; what an action of 1 adds
-LIMIT, FALL = 50.0, -100.0  # of each observation; reward of a fall
+OFFSET, TORQUE = 0.01, 20.0  # added by an action of 1; rad and N m
+LIMIT, FALL = 50.0, -100.0  # limit of an observation's elements; reward of a fall
 
 
 class Residual:
-    """A controller: the shipped law, and an action on top of it."""
+    """Controller that adds an action to the shipped law."""
 
     action = np.zeros(24)
     seen = np.zeros(48)
 
     def reset(self, seen: Observation) -> None:
-        """Take the observation; the planner does not lead."""
+        """Store the observation while the planner does not lead."""
         parts = seen.q, seen.v / 5.0, seen.tau / 100.0, seen.p, seen.pdot
         self.seen = np.clip(np.concatenate(parts), -LIMIT, LIMIT)
 
     def step(self, seen: Observation) -> Action:
-        """Return the law's action with the offset of this step."""
+        """Return the law's action plus the action of this step."""
         self.reset(seen)
         law, (offset, torque) = Action.from_law(seen.law), self.action.reshape(2, 12)
         return law._replace(
@@ -45,13 +45,13 @@ class Residual:
 
 
 class BalanceEnv(gymnasium.Env[Array, Array]):
-    """Balance through a scenario; an episode ends with a fall or with the scenario."""
+    """Balance task over a scenario; an episode ends with a fall or with the scenario."""
 
     observation_space = gymnasium.spaces.Box(-LIMIT, LIMIT, (48,), np.float64)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (24,), np.float64)
 
     def __init__(self, scenario: str = "squat", duration: float = 9.0) -> None:
-        """Load the shipped robot and a scenario of deploy/scenarios, without its kill."""
+        """Load the shipped robot, and a scenario of deploy/scenarios without its kill."""
         loaded = load_scenario(SCENARIOS / f"{scenario}.toml")
         self._scenario = msgspec.structs.replace(loaded, kill=(), duration=duration)
         self._robot = load(DEFAULT_CONFIG)
@@ -59,7 +59,7 @@ class BalanceEnv(gymnasium.Env[Array, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode on the robot's feet; the seed decides the sensors' noise."""
+        """Start an episode with a standing robot; the seed determines the sensors' noise."""
         super().reset(seed=seed, options=options)
         noise, law = int(self.np_random.integers(1 << 30)), Residual()
         self._law = law
@@ -70,7 +70,7 @@ class BalanceEnv(gymnasium.Env[Array, Array]):
         return law.seen, {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Apply an action for 10 ms; the reward is 1 for a robot that stands over its ankles."""
+        """Apply an action for 10 ms; the reward is 1 with the COM over the ankles."""
         self._law.action = np.clip(action, -1.0, 1.0)
         row = next(self._rows, None)
         if row is None:
@@ -80,7 +80,7 @@ class BalanceEnv(gymnasium.Env[Array, Array]):
 
 
 def main() -> None:
-    """Check the environment, then print the reward of the shipped law and of random actions."""
+    """Check the environment; print the rewards of the shipped law and of random actions."""
     from gymnasium.utils.env_checker import check_env  # noqa: PLC0415 - it takes a second
 
     env = BalanceEnv(duration=0.5)

@@ -1,7 +1,7 @@
-"""Hold one module: a knee's joint service without a bus, on the drive of `own_drive.py`.
+"""Hold one knee with the control cycle of a joint service and the drive of `own_drive.py`.
 
-`DriveManager.step` is one control cycle without I/O; `services/joint/loop.py` puts a drive and a
-bus around the same call. Run it: python examples/hold_one_module.py
+`DriveManager.step` is one control cycle without I/O. `services/joint/loop.py` connects the same
+call to a drive and the bus. Run: python examples/hold_one_module.py
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from shared.places import DEFAULT_CONFIG
 
 
 def main() -> None:
-    """Arm a knee, load it with 20 N m for a second, and print what it does."""
+    """Arm a knee, load it with 20 N m for a second, and print its mode, angle and torque."""
     robot = load(DEFAULT_CONFIG)
     knee = DriveManager(robot, "knee_left")
     drive = BenchDrive(q=(0.02, -1.0))

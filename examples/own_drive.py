@@ -1,7 +1,8 @@
-"""Write your own drive driver: the methods of `Drive`, here on a motor simulated in place.
+"""A drive driver of your own: the methods of `Drive` on a simulated motor.
 
-A joint service needs nothing else (docs/drives.md#add-a-drive). `read` waits for the next sample
-and never raises; a lost link is `DriveStatus.LOST`. Run it: python examples/own_drive.py
+A joint service needs no other methods (docs/drives.md#add-a-drive). `read` waits for the next
+sample and never raises; it reports a lost link as `DriveStatus.LOST`.
+Run: python examples/own_drive.py
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ FRICTION = 2.0  # N m s/rad
 
 
 class BenchDrive:
-    """A module on a bench in virtual time: each `read` moves on by 2 ms."""
+    """A module in virtual time, which each `read` advances by 2 ms."""
 
     def __init__(self, q: Pair, load: Pair = (0.0, 0.0)) -> None:
-        """Put the joint at q (phi, theta), rad, under a load, N m."""
+        """Place the joint at q (phi, theta), rad, under a load, N m."""
         self.q, self.v, self.load = list(q), [0.0, 0.0], load
         self.now_ns = NS_PER_S
         self._armed = False
         self._target: MotorTarget | None = None
 
     def read(self, _timeout_s: float) -> DriveReading:
-        """Wait for the next sample of both axes: positions in turns of the motors."""
+        """Return the next sample of both axes, in motor turns."""
         for _ in range(20):
             self._step(1e-4)
         status = DriveStatus.ARMED if self._armed else DriveStatus.IDLE
@@ -40,16 +41,16 @@ class BenchDrive:
         )
 
     def write(self, target: MotorTarget) -> None:
-        """Take what both motors' position loops shall do."""
+        """Set the targets of both motors' position loops."""
         self._target = target
 
     def write_torque(self, torque: Pair) -> None:
-        """Take torques alone: a position loop without gains."""
+        """Set torques, with the position loops' gains at zero."""
         zero = (0.0, 0.0)
         self._target = MotorTarget(zero, zero, torque, pos_gain=zero, vel_gain=zero)
 
     def arm(self, *, onboard: bool) -> None:
-        """Close the loop on both axes; this motor knows one kind of loop."""
+        """Close the loop on both axes; this motor has only one kind of loop."""
         del onboard
         self._armed = True
 
@@ -57,15 +58,15 @@ class BenchDrive:
         """Clear errors; this motor has none."""
 
     def idle(self) -> None:
-        """Open the loop: the motors give no torque."""
+        """Open the loop, so that the motors give no torque."""
         self._armed = False
 
     def set_position(self, turns: Pair) -> None:
-        """Take the motors' position, as `xrl drive zero` writes it."""
+        """Set the motors' positions, as `xrl drive zero` does."""
         self.q[:] = joint_torque(turns, 1.0 / GEAR_RATIO)
 
     def close(self) -> None:
-        """Release the link; there is none."""
+        """Close the link; this drive has none."""
 
     def _step(self, dt: float) -> None:
         self.now_ns += round(dt * NS_PER_S)
@@ -76,7 +77,7 @@ class BenchDrive:
             self.q[axis] += dt * self.v[axis]
 
     def _motor_torques(self) -> Pair:
-        """Return the firmware's law on each motor, N m."""
+        """Return each motor's torque by the firmware's law, N m."""
         t = self._target
         if not self._armed or t is None:
             return (0.0, 0.0)
@@ -91,7 +92,7 @@ class BenchDrive:
 
 
 def main() -> None:
-    """Arm the drive and let its own loop hold a target."""
+    """Arm the drive, whose own loop then holds a target."""
     drive = BenchDrive(q=(0.0, -1.0))
     here = drive.read(0.01).pos_turns
     drive.arm(onboard=True)
@@ -101,7 +102,7 @@ def main() -> None:
     drive.load = (0.0, 10.0)
     for _ in range(500):
         reading = drive.read(0.01)
-    print(f"{reading.status.name}: theta {drive.q[1]:.4f} rad under 10 N m, it began at -1")
+    print(f"{reading.status.name}: theta {drive.q[1]:.4f} rad under 10 N m; it started at -1")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Write your own operator: a hand that leads, but lets the robot have its way above 12 N.
+"""A simulated operator of your own: a hand that leads with at most 12 N along z.
 
-The simulated person is a class with one method, `force`. No controller sees it; they meet only the
-wrench at the harness. Run it: python examples/own_operator.py
+The simulated person is a class with one method, `force`. Controllers receive only the resulting
+wrench at the harness. Run: python examples/own_operator.py
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LIMIT = 12.0  # N
 
 
 class GentleHand(Operator):
-    """The shipped hand, softened: its force along z bends towards a limit."""
+    """The shipped hand with a soft limit on its force along z."""
 
     def force(
         self, wanted: Lead, height: float, rate: float, pitch: float, pitch_rate: float
@@ -29,7 +29,7 @@ class GentleHand(Operator):
 
 
 def main() -> None:
-    """Lead a squat with both hands and print how far each came, and with what force."""
+    """Lead a squat with each hand; print its peak force and the torso's final height."""
     robot = load(DEFAULT_CONFIG)
     down = (Keyframe(at=0.0, height=1.188), Keyframe(at=2.5, height=0.988))
     scenario = Scenario(name="gentle", about="down by 0.2 m", duration=3.5, keyframe=down)

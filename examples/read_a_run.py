@@ -1,6 +1,6 @@
-"""Read a run into NumPy: the COM's range and the age of the commands that a knee used.
+"""Read a run into NumPy arrays: the range of the COM, and the age of a knee's commands.
 
-Run it: xrl sim --out out/first && python examples/read_a_run.py out/first/run.mcap
+Run: xrl sim --out out/first && python examples/read_a_run.py out/first/run.mcap
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tools.logs.run_log import read_run
 
 
 def main(path: Path) -> None:
-    """Print a summary of a finished, killed or split log."""
+    """Print a summary of a log, which may be unfinished or split."""
     log = read_run(path)
     truth = [row for row in log.messages(topics.SIM_TRUTH) if row.scenario_s >= 0.0]
     t = np.array([row.scenario_s for row in truth])  # (n,), s

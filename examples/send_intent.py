@@ -1,7 +1,7 @@
-"""Send an intent over Zenoh: ask a fleet that is up to carry 40 N of the person for five seconds.
+"""Send an intent over Zenoh: request 40 N of assist from a running fleet for five seconds.
 
-First `xrl up`; when `xrl status` shows the planner leading: python examples/send_intent.py
-An intent fades out once it is no longer repeated, so it is published at 50 Hz.
+Run `xrl up`. Once `xrl status` shows that the planner leads, run: python examples/send_intent.py
+An intent that is not repeated fades out, so this script publishes it at 50 Hz.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FOR_S, ASSIST_N = 5.0, 40.0
 
 
 def main(run_dir: Path) -> None:
-    """Publish the intent and print what the planner gives."""
+    """Publish the intent, and print the assist that the planner gives."""
     fleet = SupervisedFleet.attach(run_dir)
     robot = fleet.manifest.robot()
     with open_session(robot, "assist", run_dir) as session:

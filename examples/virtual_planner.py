@@ -1,7 +1,7 @@
-"""The whole robot in virtual time: a squat, the planner killed on the way down and started again.
+"""A squat in virtual time, in which the planner is killed on the way down and restarted.
 
-`Lockstep` steps world, drives, six joint controllers, harness and planner in one process,
-bit-identical from run to run. Run it: python examples/virtual_planner.py
+`Lockstep` steps world, drives, six joint controllers, harness and planner in one process. Every run
+is bit-identical. Run: python examples/virtual_planner.py
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SQUAT = Scenario(
 
 
 def main(config: Path = DEFAULT_CONFIG) -> None:
-    """Run it and print height, hand and modes every half second."""
+    """Run the squat; print height, hand force and modes every half second."""
     fleet = Lockstep(load(config), SQUAT, seed=1)
     for truth in fleet.run():
         if truth.scenario_s >= 0.0 and round(truth.scenario_s * 100) % 50 == 0:

@@ -10,7 +10,8 @@ from typing import Any
 class FlagParser(argparse.ArgumentParser):
     """Parser that refuses abbreviated and unknown flags, and suggests the closest flag.
 
-    With argparse's abbreviations `xrl down --li` means `--limp`, which lets a standing robot fall.
+    With argparse's abbreviations, `xrl down --li` would mean `--limp`, which lets a standing robot
+    fall.
     """
 
     def __init__(self, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""Files that exist whole or not at all, however their writer ends; all results are written so."""
+"""Atomic writes, used for all results: a file exists whole or not at all."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from typing import BinaryIO
 def atomic_file(
     path: Path, *, private: bool = False, exclusive: bool = False, lasting: bool = False
 ) -> Iterator[BinaryIO]:
-    """Yield a file beside a path; it replaces the path when the block succeeds.
+    """Yield a new file beside `path`, which replaces `path` if the block succeeds.
 
-    Otherwise it is removed and the old file stays. A kill leaves `.NAME.part`, which the next try
-    replaces. `private`: for this user alone; `exclusive`: replace no file; `lasting`: return when
-    it is on the disk. Raises OSError, whose `filename` is the path, if it cannot be written or
-    exists.
+    Otherwise the new file is removed, and the old one stays. A kill leaves `.NAME.part`, which the
+    next attempt replaces. `private`: only this user has access; `exclusive`: refuse to replace a
+    file; `lasting`: return only when the file is on the disk. Raises OSError, with `path` as its
+    `filename`.
     """
     part = path.with_name(f".{path.name}.part")
     try:
         _refuse_existing(path, exclusive=exclusive)
-        part.unlink(missing_ok=True)  # of an earlier try, with whatever rights
+        part.unlink(missing_ok=True)  # of an earlier attempt; its rights may be wrong
         mode = 0o600 if private else 0o666
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             yield file
@@ -44,7 +44,7 @@ def atomic_file(
 
 
 def replace_file(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Write a file whole or not at all, as `atomic_file`."""
+    """Write a file whole or not at all, as `atomic_file` does."""
     with atomic_file(path, private=private) as file:
         file.write(content)
 
@@ -55,8 +55,8 @@ def _refuse_existing(path: Path, *, exclusive: bool) -> None:
 
 
 def _sync_directory(directory: Path) -> None:
-    """Write the new name to the disk: the directory holds it, not the file."""
-    with contextlib.suppress(OSError):  # not every file system can
+    """Write the directory, which has the file's new name, to the disk."""
+    with contextlib.suppress(OSError):  # not every file system supports this
         descriptor = os.open(directory, os.O_RDONLY)
         try:
             os.fsync(descriptor)

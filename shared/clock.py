@@ -1,9 +1,8 @@
-"""The fleet's clock, in one place so that laws never read it.
+"""The fleet's clock: CLOCK_MONOTONIC, shared by all processes of a host.
 
-CLOCK_MONOTONIC, one for all processes of a host. A simulated fleet may run in slow motion
-(`keep_pace`): if the cores are too slow for ten services in real time, the clock of all of them
-runs slower. Control, physics and log are then as on a faster machine. Only code that waits needs to
-know the pace (`machine_s`, `sleep_until`).
+Laws never read it. If the cores are too slow for ten services in real time, a simulated fleet can
+run in slow motion (`keep_pace`): the clock of all its processes runs slower, and control, physics
+and log are as on a faster machine. Only code that waits uses the pace (`machine_s`, `sleep_until`).
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ def now_ns() -> int:
 
 
 def sleep_until(deadline_ns: int) -> None:
-    """Sleep until a moment of the fleet's clock; return at once if it has passed."""
+    """Sleep until a time of the fleet's clock; return at once if it has passed."""
     remaining_ns = deadline_ns - now_ns()
     if remaining_ns > 0:
         time.sleep(machine_s(remaining_ns / NS_PER_S))
@@ -48,7 +47,7 @@ def pace() -> float:
 
 
 def keep_pace(run_dir: Path) -> None:
-    """Use the clock of the fleet in a run directory from now on; call it before any time is read.
+    """Use the clock of the fleet in a run directory; call this before any time is read.
 
     Raises FleetError if the file with its pace is malformed.
     """

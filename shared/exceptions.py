@@ -1,4 +1,4 @@
-"""The one exception tree.
+"""Exceptions of this project.
 
 Exceptions are for start-up, tools and files. On the control path a fault is a state and an event
 (docs/architecture.md#age-rule), never an exception.
@@ -15,7 +15,7 @@ from typing import Final
 class XrlError(Exception):
     """Root of the errors that this project raises.
 
-    The message says what was wrong, where, and what to do. Command line tools print it as one line
+    The message says what is wrong, where, and what to do. Command line tools print it as one line
     and exit with `exit_code`.
     """
 
@@ -25,12 +25,13 @@ class XrlError(Exception):
 DECLINED_EXIT_CODE: Final = XrlError.exit_code
 """Exit code of a verb whose question a person answered with no."""
 FELL_EXIT_CODE: Final = 1
-"""Exit code of a run in which a robot fell, or is about to at its end; of nothing else."""
+"""Exit code of a run in which a robot fell, or is about to fall at its end. No XrlError
+uses it."""
 FAULT_EXIT_CODE: Final = 3
-"""Exit code of a check that found a fault or a difference, or found nothing."""
+"""Exit code of a check that found a fault or a difference, or nothing to check."""
 BUG_EXIT_CODE: Final = 70
 """Exit code of a process that an unforeseen exception ended: a bug of this project (EX_SOFTWARE of
-sysexits.h). Python's own would be `FELL_EXIT_CODE`."""
+sysexits.h). Python's default would be `FELL_EXIT_CODE`."""
 HUNG_UP_EXIT_CODE: Final = 128 + signal.SIGHUP
 """Exit code of a verb whose terminal is gone, as after a dropped ssh session."""
 
@@ -39,7 +40,7 @@ class ConfigError(XrlError):
     """A configuration or scenario file is invalid."""
 
     def __init__(self, file: str, key: str, found: str, expected: str) -> None:
-        """Take the file, the dotted key, the found and the right value."""
+        """Store the file, the dotted key, the value found and the right value."""
         super().__init__(f"{file}: {key}: {found}; {expected}")
         self.file = file
         self.key = key
@@ -68,7 +69,7 @@ class FleetError(XrlError):
 
 
 class HungUpError(FleetError):
-    """The terminal from which a person led the robot is gone."""
+    """The terminal from which a person led the robot was closed."""
 
     exit_code = HUNG_UP_EXIT_CODE
 
@@ -91,7 +92,7 @@ _REMEDIES: Final = {
 
 
 def os_error_in_words(error: OSError) -> str:
-    """Return in one line what the system refused, and the file if it named one."""
+    """Return a system error as one line: the file if known, the error, the remedy."""
     said = error.strerror or str(error) or type(error).__name__
     name = "" if error.filename is None else f"{str(error.filename)[:200]}: "
     remedy = _REMEDIES.get(error.errno or 0, "")
@@ -102,7 +103,7 @@ def os_error_in_words(error: OSError) -> str:
 
 def _has_folder() -> bool:
     try:
-        os.getcwd()  # noqa: PTH109 - Path.cwd is this, and its error is what is asked for
+        os.getcwd()  # noqa: PTH109 - Path.cwd calls it; only its error matters here
     except OSError:
         return False
     return True

@@ -1,7 +1,7 @@
-"""Optional packages: the extra of pyproject.toml that brings each, and the error without it.
+"""Optional packages: the extra of pyproject.toml with each, and the error if one is missing.
 
-`pip install xrl` brings what a robot in service needs. A verb of an owner's desk calls `require`
-before it begins. A module that uses such a package imports it by `late`, so that the module can be
+`pip install xrl` installs the packages that a robot needs in operation. A verb that needs others
+first calls `require`. A module imports such a package with `late`, so that the module can be
 imported without the package.
 """
 
@@ -31,20 +31,20 @@ EXTRAS: Final = {
     "cluster": ("distributed",),
     "bench": ("cyclonedds", "iceoryx2", "zmq"),
 }
-"""The packages of each extra, as they are imported."""
+"""Packages of each extra, by import name."""
 
 UNLOCKED: Final = frozenset({"bench"})
-"""Extras that `requirements.lock` does not hold."""
+"""Extras that `requirements.lock` does not contain."""
 
 ON_ROBOTS: Final = frozenset({"ros2", "usb"})
-"""Extras of some robots: `./deploy/install --runtime NAME` adds one, from a lock of its own."""
+"""Extras for some robots: `./deploy/install --runtime NAME` installs one from its own lock."""
 
 
 def require(extra: str, otherwise: str = "") -> None:
-    """Import the packages of an extra: after an upgrade in place one may be there and fail.
+    """Import the packages of an extra; after an upgrade, the import of an installed one may fail.
 
-    `otherwise` names the alternative without them. Raises MissingPackageError if one is not
-    installed or cannot be imported.
+    Raises MissingPackageError if a package is not installed or cannot be imported. Its text also
+    offers the alternative `otherwise`, if given.
     """
     missing = [name for name in EXTRAS[extra] if not _is_there(name)]
     if missing:
@@ -59,7 +59,7 @@ def is_installed(extra: str) -> bool:
 
 
 def _is_there(package: str) -> bool:
-    """Return True if a package is installed; `plants` of deploy, also on the path, is not one."""
+    """Return True if a package is installed; a folder of deploy/ that is on the path is not one."""
     found = importlib.util.find_spec(package)
     if found is None or found.origin is not None:
         return found is not None
@@ -68,7 +68,7 @@ def _is_there(package: str) -> bool:
 
 
 def _missing_package(extra: str, missing: list[str], otherwise: str = "") -> MissingPackageError:
-    """Return the error that names packages, their extra and the command that brings it."""
+    """Return the error that names packages, their extra and the command that installs it."""
     *others, last = missing
     are, them = ("are", "them") if others else ("is", "it")
     names = f"{', '.join(others)} and {last}" if others else last
@@ -91,8 +91,8 @@ def _error(trouble: str, extra: str, them: str, otherwise: str) -> MissingPackag
 def _imported(module: str, otherwise: str = "") -> ModuleType:
     """Import a module such as `matplotlib.patches`.
 
-    Raises MissingPackageError if its package is not installed, or with the package's own words if
-    the import fails for another reason: files of two versions, or a library of the system missing.
+    Raises MissingPackageError if its package is not installed, or with the original message if the
+    import fails for another reason, such as mixed versions or a missing system library.
     """
     package = module.partition(".")[0]
     extra = next((extra for extra, names in EXTRAS.items() if package in names), None)
@@ -109,7 +109,7 @@ def _imported(module: str, otherwise: str = "") -> ModuleType:
 
 
 def late(module: str) -> Any:
-    """Return a stand-in for a module such as `matplotlib.patches`, imported when it is first used.
+    """Return a stand-in for a module such as `matplotlib.patches`, which its first use imports.
 
     That use raises MissingPackageError if the package is not installed or cannot be imported.
     """
@@ -129,7 +129,7 @@ class _LateModule:
 
 
 def libusb_fix() -> str:
-    """Return the command that installs libusb-1.0.so.0, which the `odrive` package loads."""
+    """Return the command or program that installs libusb-1.0.so.0, which `odrive` loads."""
     if shutil.which("apt-get"):
         return "`sudo apt-get install libusb-1.0-0`"
     if shutil.which("dnf"):

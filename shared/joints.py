@@ -1,4 +1,4 @@
-"""The joint order, defined once (docs/law.md#the-robot).
+"""Order and names of the joints (docs/law.md#the-robot).
 
 q, v and tau are vectors in R^12: six modules, each (phi, theta), in `MODULES` order.
 phi turns about x (frontal), theta about y (sagittal); positive theta leans forward.
@@ -12,7 +12,7 @@ MODULES: Final = ("ankle_right", "knee_right", "hip_right", "ankle_left", "knee_
 """Module names in the order of q, v and tau."""
 
 SIDES: Final = ("right", "left")
-"""Leg order: the right leg holds joints 0..5, the left leg 6..11."""
+"""Leg order: the right leg has joints 0..5, the left leg 6..11."""
 
 KINDS: Final = ("ankle", "knee", "hip")
 """Joint kinds from the foot up."""

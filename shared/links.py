@@ -1,7 +1,7 @@
-"""Table of the links whose traffic can be impaired: commands, states, wrenches and attitudes.
+"""Table of the links that can be impaired: those of commands, states, wrenches and attitudes.
 
-Each link is a pair of processes with a connection of its own (`shared.bus.session.peers_of`); one
-direction of it is named `SENDER->RECEIVER`.
+A link is the connection of two processes (`shared.bus.session.peers_of`). Each of its directions is
+named `SENDER->RECEIVER`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ class Pair(NamedTuple):
 
     @property
     def there(self) -> str:
-        """Name of the direction from the one that dials."""
+        """Name of the direction from the process that dials."""
         return f"{self.dials}->{self.listens}"
 
     @property
     def back(self) -> str:
-        """Name of the direction from the one that listens."""
+        """Name of the direction from the process that listens."""
         return f"{self.listens}->{self.dials}"
 
 
@@ -63,7 +63,7 @@ def endpoint_through(pair: Pair) -> str:
 def directions_of(link: str, file: str = "--link", key: str = "link") -> tuple[str, ...]:
     """Return the directions that a name of `DIRECTIONS` or `GROUPS` stands for.
 
-    `file` and `key` name the source of an unknown name in the ConfigError.
+    Raises ConfigError, with the name's source `file` and `key`, for any other name.
     """
     if link in GROUPS:
         return GROUPS[link]

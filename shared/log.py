@@ -8,9 +8,9 @@ import stat
 
 
 def setup(service: str) -> logging.Logger:
-    """Send this process's log lines to stderr with its name and return its logger.
+    """Send this process's log lines to stderr with its name, and return its logger.
 
-    A line that a pipe does not take at once is lost, so that a hung supervisor blocks nobody.
+    A line that does not fit into a full pipe is lost, so that a hung supervisor blocks no service.
     """
     if stat.S_ISFIFO(os.fstat(2).st_mode):
         os.set_blocking(2, False)

@@ -1,4 +1,4 @@
-"""Locations of this project's own files, the robot file in use, and the user.
+"""Locations of this project's own files, the robot file in use, and the user's name and home.
 
 In a checkout the data files are in `deploy/`. A wheel has the same files in `shared/files/`
 (`deploy/build_hook.py`), without a source tree around the packages and without git. The user may
@@ -16,12 +16,12 @@ from typing import Final
 from shared.exceptions import ConfigError, RunError, XrlError
 
 CHECKOUT: Final = Path(__file__).resolve().parents[1]
-"""Top of this checkout; where the packages are installed, the folder that holds them."""
+"""Top of this checkout, or the folder that contains the installed packages."""
 
 _INSTALLED: Final = Path(__file__).resolve().with_name("files")
 IS_CHECKOUT: Final = not _INSTALLED.is_dir()
 FILES: Final = CHECKOUT / "deploy" if IS_CHECKOUT else _INSTALLED
-"""Folder of the files as shipped: robot file, gain schedule, process table, scenarios, settings."""
+"""Folder of the shipped files: robot file, gain schedule, process table, scenarios, settings."""
 DEFAULT_CONFIG: Final = FILES / "robot.toml"
 """The robot file as shipped."""
 SCENARIOS: Final = FILES / "scenarios"
@@ -29,7 +29,7 @@ SCENARIOS: Final = FILES / "scenarios"
 ROBOT_FILE: Final = "robot.toml"
 """Name of the robot file that is used from the working directory without `--config`."""
 NOT_NAMED: Final = "\0"
-"""Default of `--config` on a command line: text that no argument can be."""
+"""Default of `--config`: a text that no argument can contain."""
 HELP: Final = f"robot file (default: {ROBOT_FILE} in the working directory, else the shipped one)"
 
 
@@ -51,10 +51,10 @@ def refuse_shipped(path: Path) -> None:
 
 
 def robot_file(given: Path | None = None) -> Path:
-    """Return the robot file in use; report on stderr one found in the working directory.
+    """Return the robot file in use; report it on stderr if found in the working directory.
 
-    The file given by `--config`, else `robot.toml` of the working directory (absolute), else the
-    shipped one. Raises ConfigError as `robot_file_here`.
+    It is the file given by `--config`, else `robot.toml` of the working directory (absolute), else
+    the shipped one. Raises ConfigError as `robot_file_here` does.
     """
     found = given or robot_file_here()
     if found is None:
@@ -67,8 +67,8 @@ def robot_file(given: Path | None = None) -> Path:
 def robot_file_here() -> Path | None:
     """Return `robot.toml` of the working directory, absolute; None if it is missing or shipped.
 
-    A dangling link counts: the shipped robot must not replace a lost file. Raises ConfigError if it
-    belongs to another user, who could choose the robot for anyone who works here.
+    A dangling link counts as a file, because the shipped robot must not replace a lost one. Raises
+    ConfigError if it belongs to another user, who could choose the robot for anyone working here.
     """
     if not os.path.lexists(ROBOT_FILE):
         return None
@@ -98,10 +98,10 @@ def user_name() -> str:
 
 
 def in_home(path: str | Path) -> Path:
-    """Return a path with its `~` replaced by a home; XrlError if there is no such home."""
+    """Return a path with its `~` replaced by a home; raise XrlError if that is unknown."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
         raise XrlError(
-            f"{path}: {user_name()} has no such home directory; set HOME, or use an absolute path"
+            f"{path}: home directory not found for {user_name()}; set HOME, or use an absolute path"
         ) from None

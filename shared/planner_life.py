@@ -1,10 +1,10 @@
-"""Death of the planner's process, seen at once by the joint services of its host.
+"""End of the planner's process, detected immediately by the joint services of its host.
 
-The kernel marks a word of shared memory when the thread that put its number there ends, however it
-ends (robust futexes: set_robust_list(2)). A reader only reads memory, without a system call. A
-descriptor of the process (pidfd) and its closed links show the end 8 to 18 ms later, because its
-memory is torn down first. This is a second trigger beside the age rule (50 ms), which alone covers
-a planner that hangs or runs on another host.
+The kernel marks a word of shared memory when the thread whose number is in it ends for any reason
+(robust futexes: set_robust_list(2)). Reading the word needs no system call. A pidfd and closed
+links show the end 8 to 18 ms later, because the kernel first frees the process's memory. This is a
+second trigger besides the age rule (50 ms), which alone covers a planner that hangs or runs on
+another host.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _WORD_AT, _SESSION_AT = 8, 16
 _WORD: Final = struct.Struct("<L")
 _SESSION: Final = struct.Struct("<Q")
 _SEEN: Final = struct.Struct("<LLQ")
-"""Layout of what a reader reads, from the word on."""
+"""Layout of the part that a reader reads: the word and everything after it."""
 _OWNER_DIED: Final = 0x4000_0000
 """FUTEX_OWNER_DIED."""
 _SET_ROBUST_LIST: Final = {"x86_64": 273, "aarch64": 99}
@@ -52,10 +52,10 @@ class _Head(ctypes.Structure):
 
 
 class OwnLife:
-    """The planner's side: its thread's number in the word, and the session in which it leads."""
+    """The planner's side: writes its thread's number and its session into the memory."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Open or create the memory. Keep the object alive: the kernel holds its address.
+        """Open or create the memory. Keep the object alive: the kernel stores its address.
 
         Raises:
             FleetError: it cannot be created.
@@ -68,8 +68,8 @@ class OwnLife:
         self._marked = _set_robust_list(self._head)
 
     def announce(self, session: int) -> None:
-        """Publish that this thread, which lives as long as the process, leads in a session."""
-        if self._marked:  # otherwise nobody would see its end
+        """Publish the session and the number of this thread, which lives as long as the process."""
+        if self._marked:  # otherwise no reader could detect its end
             _WORD.pack_into(self._memory, _WORD_AT, threading.get_native_id())
             _SESSION.pack_into(self._memory, _SESSION_AT, session)
 
@@ -77,7 +77,7 @@ class OwnLife:
 def _set_robust_list(head: _Head) -> bool:
     """Make the kernel mark the entry when this thread ends; False if it cannot.
 
-    This replaces the C library's list for this thread: it must use no robust mutex.
+    This replaces the C library's list for this thread, which must not use a robust mutex.
     """
     number = _SET_ROBUST_LIST.get(platform.machine())
     if number is None:
@@ -91,7 +91,7 @@ class PlannerLife:
     """A joint service's side: watches the planner of its host."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Open the memory, as `OwnLife`."""
+        """Open or create the memory, as `OwnLife` does."""
         self._memory = mapped(path_of(run_dir), _LIFE.size)
         self._told = 0
 
@@ -105,11 +105,14 @@ class PlannerLife:
 
 
 def if_possible(end: Callable[[Path], End], run_dir: Path) -> End | None:
-    """Return one of the two sides, or None and a warning: no service fails for a second trigger."""
+    """Open one of the two sides; if that fails, log a warning and return None.
+
+    A service can run without this trigger.
+    """
     try:
         return end(run_dir)
     except FleetError as error:
         log.get("xrl").warning(
-            "%s; only the age of its commands will show that a planner has ended", error
+            "%s; the end of a planner will show only from the age of its commands", error
         )
         return None

@@ -16,11 +16,11 @@ from shared.exceptions import BUG_EXIT_CODE, XrlError, os_error_in_words
 from shared.run_directory import default_run_dir, service_directory
 
 SOCKET_PATH_MAX = 100
-"""Maximum length of a UNIX socket's path that works everywhere; the kernel takes 107 bytes."""
+"""Maximum length of a UNIX socket's path that works everywhere; the kernel allows 107 bytes."""
 
 
 def service_parser(description: str, example: str) -> argparse.ArgumentParser:
-    """Return a parser with the arguments that every service takes."""
+    """Return a parser with the arguments of every service."""
     parser = FlagParser(
         description=description,
         epilog=f"example:\n  {example}",
@@ -43,7 +43,7 @@ def add_injected(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--injected",
         action="store_true",
-        help="dial through the network proxy (services.network_proxy)",
+        help="connect through the network proxy (services.network_proxy)",
     )
 
 
@@ -51,10 +51,10 @@ class StopFlag:
     """True once SIGTERM or SIGINT was received; the loops check it once a cycle."""
 
     def __init__(self, *also: signal.Signals) -> None:
-        """Stop at SIGTERM and SIGINT, and at `also`."""
+        """Handle SIGTERM, SIGINT and the signals in `also`."""
         self.stopped = False
         self.interrupted = False
-        """SIGINT was received: the whole fleet goes down, not this process alone."""
+        """True if SIGINT was received: the whole fleet stops, not only this process."""
         for number in (signal.SIGTERM, signal.SIGINT, *also):
             signal.signal(number, self._stop)
 
@@ -68,16 +68,16 @@ class StopFlag:
 
 
 def freeze_garbage() -> None:
-    """Switch the cyclic collector off after start-up: no pauses on the control path."""
+    """Switch the cyclic garbage collector off after start-up, so that it never pauses control."""
     gc.collect()
     gc.freeze()
     gc.disable()
 
 
 def run_service(main: Callable[[], int]) -> None:
-    """Run a service's main; an error becomes one line and an exit code, a bug its traceback too.
+    """Run a service's main; log an error in one line, a bug with its traceback, and exit.
 
-    Files that it creates are private to this user.
+    Files that the service creates are private to this user.
     """
     os.umask(0o077)
     try:

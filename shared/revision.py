@@ -1,6 +1,6 @@
 """Commit of this code: from git in a checkout, from a file in a wheel.
 
-Standard library only, because the wheel's build uses it too (`deploy/build_hook.py`).
+It uses only the standard library, because the wheel's build uses it too (`deploy/build_hook.py`).
 """
 
 from __future__ import annotations
@@ -22,9 +22,8 @@ _GIT_TIMEOUT_S: Final = 5.0
 def code(root: Path = CHECKOUT) -> dict[str, str]:
     """Return `git_commit` and `git_dirty` ("true"/"false"), of a checkout or of a wheel's origin.
 
-    Both are "unknown" if `root` is not the top of a git checkout with a commit, or git is missing:
-    a wheel installed inside another checkout is not that checkout. They are unknown, too, for a
-    wheel that was built without git.
+    Both are "unknown" if git is missing, if the wheel was built without git, or if `root` is not
+    the top of a git checkout with a commit (a wheel may be installed inside another checkout).
     """
     try:
         built_from: dict[str, str] = json.loads((root / BUILT_FROM).read_text(encoding="utf-8"))
@@ -52,9 +51,9 @@ def _checked_out(root: Path) -> dict[str, str]:
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """Return what git prints, or None if it fails for any reason.
+    """Return git's output, or None if git fails.
 
-    Works in a checkout that belongs to root, too, where a service runs as another user.
+    Also works for a service that runs as another user in a checkout that belongs to root.
     """
     try:
         done = subprocess.run(

@@ -1,12 +1,11 @@
 """The run directory of a fleet, with its logs, and the live directory, with its sockets and memory.
 
-The run directory names the fleet and may be on a disk. Everything that a restart creates, removes
-or opens for writing is in the live directory (`live_dir`), in memory: a service must come back
-after the disk has turned read-only.
+The run directory identifies the fleet and may be on a disk. Everything that a restart creates,
+removes or opens for writing is in the live directory (`live_dir`), in memory, so that a service can
+restart after the disk has become read-only.
 
-The names of both can be guessed, and both may be in a folder where everybody may write. So a
-directory that belongs to another user, or that others may write to, is refused wherever it is
-named.
+Both names can be guessed, and both directories may be in a world-writable folder. So a directory
+that belongs to another user, or that others may write to, is refused.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ from shared.exceptions import FleetError, os_error_in_words
 PRIVATE: Final = stat.S_IRUSR | stat.S_IWUSR
 
 RUN_DIR_VARIABLE = "XRL_RUN_DIR"
-"""Environment variable that names the run directory of the fleet."""
+"""Environment variable with the default run directory."""
 
 
 FLEET_VARIABLE: Final = "XRL_FLEET"
-"""Environment variable of every process that a fleet's supervisor starts: its run directory."""
+"""Environment variable with the run directory, which the supervisor sets for its processes."""
 
 _MEMORY_FOLDERS: Final = (Path("/run/lock"), Path("/dev/shm"))  # noqa: S108 - owners are checked
 """Folders for the live directories, best first. At logout systemd may remove a user's files from
@@ -44,7 +43,7 @@ _MEMORY_TYPES: Final = ("tmpfs", "ramfs")
 
 
 def default_run_dir() -> Path:
-    """Return the run directory: sockets, logs and the supervisor's files of one fleet."""
+    """Return the default run directory, for logs and the supervisor's files of one fleet."""
     return Path(os.environ.get(RUN_DIR_VARIABLE) or f"/tmp/xrl-{os.getuid()}")  # noqa: S108 - short on purpose: socket paths have 107 bytes
 
 
@@ -65,8 +64,8 @@ def live_dir(run_dir: Path) -> Path:
 def _memory_folder(folders: tuple[Path, ...]) -> Path | None:
     """Return the first folder that is in memory and where every user may write, or None.
 
-    Decides by type and mode, not by what this process may write: a systemd unit and a shell must
-    find the same folder.
+    The folder's type and mode decide, not the rights of this process, because a systemd unit and a
+    shell must find the same folder.
     """
     mounts = [line.split() for line in Path("/proc/self/mounts").read_text("utf-8").splitlines()]
     for folder in folders:
@@ -80,7 +79,7 @@ def _memory_folder(folders: tuple[Path, ...]) -> Path | None:
 
 
 def make_live_dir(run_dir: Path) -> Path:
-    """Return the live directory of a run directory, made for this user alone if it is missing."""
+    """Return the live directory of a run directory; create it, for this user only, if missing."""
     path = live_dir(run_dir)
     path.mkdir(mode=0o700, parents=True, exist_ok=True)
     return path
@@ -90,8 +89,8 @@ def check_own(path: Path, *, alone: bool = True) -> None:
     """Refuse a run directory that is not this user's, or whose live directory is not.
 
     A missing directory is accepted. `alone`: also refuse a directory if others may write to it or
-    to one above it. A fleet is not started or acted on there. It can be stopped, because the rights
-    may have changed while it was up. Raises FleetError.
+    to one above it. Starting or changing a fleet requires this stricter check. Stopping one does
+    not, because the rights may have changed while the fleet ran. Raises FleetError.
     """
     for directory in dict.fromkeys((path, live_dir(path))):
         _check_directory(directory, alone=alone)
@@ -110,7 +109,9 @@ def _check_directory(path: Path, *, alone: bool) -> None:
     except OSError as error:
         if error.errno == errno.EIO:
             return  # the disk has failed; the fleet on it can still be stopped and signalled
-        raise FleetError(f"{path}: cannot be used as a run directory: {error.strerror}") from None
+        raise FleetError(
+            f"{path}: cannot be used as a run directory: {error.strerror}; give another --run-dir"
+        ) from None
     if not stat.S_ISDIR(found.st_mode):
         raise FleetError(f"{path}: is not a directory; give another --run-dir")
     _check_owner(path, found.st_uid)
@@ -126,22 +127,24 @@ def _check_directory(path: Path, *, alone: bool) -> None:
 def _check_parents(path: Path) -> None:
     """Refuse a directory that another user could replace by writing to one above it.
 
-    As sshd's StrictModes: each directory above belongs to this user or root. If others may write to
-    it, only the owner of an entry may rename that entry (the sticky bit, as /tmp has it).
+    As with sshd's StrictModes, each directory above must belong to this user or root. If others may
+    write to it, it must have the sticky bit, as /tmp does: then only an entry's owner may rename
+    it.
     """
     for above in dict.fromkeys((*path.absolute().parents, *path.resolve().parents)):
         try:
             found = above.stat()
         except FileNotFoundError:
-            continue  # it is made for this user alone
+            continue  # it will be created for this user only
         if found.st_uid not in (0, os.getuid()):
             wrong = f"{above} belongs to another user, who can replace it"
+            remedy = "give another --run-dir"
         elif _others_may_rename_in(found):
-            remedy = f"run `chmod go-w {shlex.quote(str(above))}`"
-            wrong = f"other users can write to {above} and replace it; {remedy}"
+            wrong = f"other users can write to {above} and replace it"
+            remedy = f"run `chmod go-w {shlex.quote(str(above))}`, or give another --run-dir"
         else:
             continue
-        raise FleetError(f"{path}: {wrong}; or give another --run-dir")
+        raise FleetError(f"{path}: {wrong}; {remedy}")
 
 
 def _others_may_rename_in(directory: os.stat_result) -> bool:
@@ -152,7 +155,7 @@ def _others_may_rename_in(directory: os.stat_result) -> bool:
 
 
 def _is_own_group(gid: int) -> bool:
-    """Return True for the group that many systems make for each user, without other members."""
+    """Return True for a user's own group, as many systems create it, without other members."""
     try:
         group, user = grp.getgrgid(gid), pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
@@ -161,9 +164,10 @@ def _is_own_group(gid: int) -> bool:
 
 
 def open_private(path: Path) -> BinaryIO:
-    """Open or create a file to read and write, for this user alone, whatever the umask.
+    """Open or create a file to read and write, for this user only, regardless of the umask.
 
-    If others had access to it, they lose it. Raises OSError if it is a link or another user's.
+    If others had access, they lose it. Raises OSError if the file is a link or belongs to another
+    user.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
     os.fchmod(descriptor, PRIVATE)
@@ -171,9 +175,10 @@ def open_private(path: Path) -> BinaryIO:
 
 
 def mapped(path: Path, size: int) -> mmap.mmap:
-    """Return a shared file as memory; create it and its directory if missing, for this user alone.
+    """Map a shared file into memory; create it and its directory, for this user only, if missing.
 
-    Its space is allocated now: on a full disk the first store would end the process (SIGBUS).
+    Its space is allocated now, because on a full disk the first store would end the process
+    (SIGBUS).
 
     Raises:
         FleetError: it cannot be created.
@@ -190,7 +195,7 @@ def mapped(path: Path, size: int) -> mmap.mmap:
 
 @contextlib.contextmanager
 def private_files() -> Iterator[None]:
-    """Make files that are created meanwhile private to this user, whatever the umask."""
+    """Make files created in the block private to this user, regardless of the umask."""
     before = os.umask(0o077)
     try:
         yield
@@ -199,17 +204,20 @@ def private_files() -> Iterator[None]:
 
 
 def service_directory(text: str) -> Path:
-    """Return the run directory of a service, checked if it was started by hand.
+    """Return the run directory of a service; check it if a person started the service.
 
     Under a supervisor it was checked when the fleet started. A service that replaces a crashed one
-    starts whatever the directory has become, because its module must be held. Raises
-    argparse.ArgumentTypeError as `check_own`.
+    starts even if the directory has changed since, because its module must be held. Raises
+    argparse.ArgumentTypeError if `check_own` refuses it.
     """
     return Path(text) if FLEET_VARIABLE in os.environ else own_directory(text, alone=True)
 
 
 def own_directory(text: str, *, alone: bool = False) -> Path:
-    """Return a run directory named on a command line; ArgumentTypeError where `check_own` fails."""
+    """Return a run directory named on a command line.
+
+    Raises argparse.ArgumentTypeError if `check_own` refuses it.
+    """
     path = Path(text)
     try:
         check_own(path, alone=alone)

@@ -1,4 +1,4 @@
-"""Priority, processors and locked memory of each process, by one table (docs/networks.md).
+"""Priority, processors and locked memory of each process, from one table (docs/networks.md).
 
 Call `apply` before the bus is opened: the bus's threads inherit priority and processors.
 """
@@ -17,12 +17,12 @@ from typing import Final, Literal, NamedTuple
 from shared.joints import SIDES, side_of
 
 PINNED_VARIABLE: Final = "XRL_PINNED"
-"""Environment variable; with "1" the processes stay on their half of the processors. The fleet's
-process table sets it (`deploy/processes.toml`)."""
+"""Environment variable; "1" keeps each process on its half of the processors. The fleet's process
+table sets it (`deploy/processes.toml`)."""
 
 
 class _ProcessSchedule(NamedTuple):
-    """A process's row."""
+    """Row of one kind of process."""
 
     fifo: int
     """SCHED_FIFO priority, 1 .. 99."""
@@ -39,19 +39,20 @@ TABLE: Final[dict[str, _ProcessSchedule]] = {
     "imu": _ProcessSchedule(10, "first"),
     "recorder": _ProcessSchedule(5, "second"),
 }
-"""By kind of process. The right leg is on the first half, the left leg on the second. Without
-real-time priority the recorder lost 600 and 1200 messages in a demo, on any processor."""
+"""Rows by kind of process. The right leg is on the first half, the left leg on the second. Without
+real-time priority the recorder lost 600 and 1200 messages in two demos, on any processor."""
 
 _PR_SET_TIMERSLACK: Final = 29
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "armv7l": 380}
 _SCHED_ATTR: Final = struct.Struct("=IIQiIQQQ")
 """size, policy, flags, nice, priority, runtime, deadline, period."""
 SLICE_NS: Final = 100_000
-"""Shortest slice that the kernel grants; a short slice is a near deadline (EEVDF)."""
+"""Shortest slice that the kernel grants; a short slice gives an early deadline (EEVDF)."""
 TIMER_SLACK_NS: Final = 1_000
 """Maximum delay at the end of a sleep; the default is 50 us."""
 NO_PAUSE: Final = "kernel.sched_rt_runtime_us=-1"
-"""Kernel setting that ends the pause of `real_time_pause_ms`, before Linux 6.12: deploy/sysctl."""
+"""Kernel setting (deploy/sysctl) that, before Linux 6.12, disables the pause that
+`real_time_pause_ms` returns."""
 IDLE_LATENCY: Final = "dev/cpu_dma_latency"
 """Kernel file for the maximum wake-up time of an idle processor (PM QoS)."""
 _CAP_IPC_LOCK: Final = 14
@@ -59,9 +60,9 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def apply(kind: str, module: str = "") -> str:
-    """Give this process, of a kind in `TABLE`, its priority, processors and locked memory.
+    """Set this process's priority, processors and locked memory, by its kind in `TABLE`.
 
-    Returns what was granted.
+    Returns a description of what was granted.
     """
     granted = [raise_priority(TABLE[kind].fifo)]
     if os.environ.get(PINNED_VARIABLE) == "1":
@@ -72,7 +73,7 @@ def apply(kind: str, module: str = "") -> str:
 
 
 def half_of(processors: Collection[int], kind: str, module: str = "") -> set[int]:
-    """Return a process's processors, out of the available ones; a single one is for all."""
+    """Return a process's half of the available processors; if there is only one, all share it."""
     half = TABLE[kind].half
     if half == "by leg":
         half = "first" if side_of(module) == SIDES[0] else "second"
@@ -119,7 +120,7 @@ def keep_processors_awake(root: Path = Path("/")) -> int | None:
     """Keep idle processors awake as long as the returned descriptor stays open; None if refused.
 
     A processor that sleeps between two cycles wakes up slowly and with cold caches: in three pairs
-    of runs the fleet took 8 to 19 % less time on processors that stay awake.
+    of runs the fleet took 8 to 19 % less processor time on processors that stayed awake.
     """
     try:
         held = os.open(root / IDLE_LATENCY, os.O_WRONLY)
@@ -140,7 +141,7 @@ def has_real_time(pid: int) -> bool | None:
 def real_time_pause_ms(root: Path = Path("/")) -> float:
     """Return how long the kernel pauses real-time processes that fill a processor, ms.
 
-    By default 50 ms of each second. 0: never, or unknown.
+    The default is 50 ms of each second. Returns 0 if it never does so, or if unknown.
     """
     kernel = root / "proc/sys/kernel"
     try:
@@ -153,9 +154,9 @@ def real_time_pause_ms(root: Path = Path("/")) -> float:
 
 
 def _real_time_limit_us() -> int | None:
-    """Lift the limit on real-time computing without a pause; return the limit that stays, us.
+    """Lift the limit on uninterrupted real-time computing; return the limit that remains, us.
 
-    Beyond it the kernel ends a process (SIGXCPU, then SIGKILL). A long cycle must not end a
+    Beyond it the kernel ends a process (SIGXCPU, then SIGKILL), but a long cycle must not end a
     service.
     """
     soft, _hard = resource.getrlimit(resource.RLIMIT_RTTIME)
@@ -163,7 +164,7 @@ def _real_time_limit_us() -> int | None:
         return None
     try:
         resource.setrlimit(resource.RLIMIT_RTTIME, (resource.RLIM_INFINITY,) * 2)
-    except (OSError, ValueError):  # the hard limit is lower, and only root may raise that
+    except (OSError, ValueError):  # the hard limit is lower, and only root may raise it
         return soft
     return None
 
@@ -185,8 +186,8 @@ def short_slice() -> str:
 def _lock_memory() -> bool:
     """Keep in memory every page that this process has touched or will touch; True if granted.
 
-    Pages that are never touched, such as most of each thread's stack, take no memory. Under a limit
-    nothing is locked: beyond it, an allocation would fail in the middle of the work.
+    Pages that are never touched, such as most of each thread's stack, take no memory. If locking is
+    limited, nothing is locked, because an allocation beyond the limit would fail in operation.
     """
     if not may_lock():
         return False

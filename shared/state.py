@@ -1,6 +1,6 @@
 """State of a law as data: a mutable struct that holds everything that changes, and nothing else.
 
-A law keeps its state in `state`, and continues bit for bit from a copy of it.
+A law stores its state in `state`, and continues bit for bit from a copy.
 """
 
 from __future__ import annotations

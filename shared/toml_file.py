@@ -1,8 +1,8 @@
 """Read TOML files into typed structs, with every number inside its `Range`.
 
-Text is UTF-8. A byte order mark, which Windows' editors write, is skipped: TOML and JSON have no
-place for it. Invalid content is refused with the file, the key, the value and the right value
-(`shared.exceptions.ConfigError`).
+Text is UTF-8. A byte order mark, which Windows editors write, is skipped, because TOML and JSON do
+not allow one. Invalid content is refused with an error that names the file, the key, the value and
+the right value (`shared.exceptions.ConfigError`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import msgspec
 from shared.exceptions import ConfigError
 
 _OTHERS: Final = (
-    ("UTF-32", codecs.BOM_UTF32_LE),  # before UTF-16, with whose mark it begins
+    ("UTF-32", codecs.BOM_UTF32_LE),  # before UTF-16, because its mark begins with UTF-16's
     ("UTF-32", codecs.BOM_UTF32_BE),
     ("UTF-16", codecs.BOM_UTF16_LE),
     ("UTF-16", codecs.BOM_UTF16_BE),
@@ -40,7 +40,10 @@ _OTHERS: Final = (
 
 
 def decoded(content: bytes) -> str:
-    """Return the text of a file's content; UnicodeError names another encoding or the bad byte."""
+    """Return the text of a file's content.
+
+    Raises UnicodeError, with the encoding or the bad byte, if it is not UTF-8.
+    """
     for name, mark in _OTHERS:
         if content.startswith(mark):
             raise UnicodeError(f"is {name}; save it as UTF-8")
@@ -54,7 +57,7 @@ def decoded(content: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file; OSError if it cannot be read, UnicodeError if it is not UTF-8."""
+    """Return a file's text; raise OSError if it cannot be read, UnicodeError if it is not UTF-8."""
     return decoded(path.read_bytes())
 
 
@@ -73,11 +76,14 @@ SIZE_MAX: Final = 1 << 24
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the file; unknown keys are refused."""
+    """Table of a file; unknown keys are refused."""
 
 
 def read_toml(path: Path, into: type[S]) -> S:
-    """Read a TOML file into a struct, with every number inside its `Range`, or ConfigError."""
+    """Read a TOML file into a struct, with every number inside its `Range`.
+
+    Raises ConfigError if the file cannot be read or is invalid.
+    """
     file = str(path)
     try:
         found = path.stat()
@@ -90,8 +96,12 @@ def read_toml(path: Path, into: type[S]) -> S:
         text = read_text(path)
     except FileNotFoundError:
         raise ConfigError(file, "(file)", "not found", "give the path of a TOML file") from None
-    except (OSError, UnicodeError) as error:
-        raise ConfigError(file, "(file)", f"cannot be read: {error}", "give a TOML file") from None
+    except OSError as error:
+        wrong = f"cannot be read: {error.strerror or error}"
+        raise ConfigError(file, "(file)", wrong, "give the path of a readable TOML file") from None
+    except UnicodeError as error:
+        wrong = f"cannot be read: {error}".partition("; ")[0]
+        raise ConfigError(file, "(file)", wrong, "give a TOML file in UTF-8") from None
     return parse_toml(text, file, into)
 
 
@@ -132,7 +142,7 @@ def _as_config_error(file: str, raw: dict[str, Any], into: Any, message: str) ->
 def _follow(path: str, raw: Any, hint: Any) -> tuple[str, Any, Any]:
     """Return the full key, the value and the type hint at a msgspec path.
 
-    msgspec writes `[...]` for an entry of a free table: the first entry that does not fit.
+    msgspec writes `[...]` for an entry of a free table; this is the first entry that does not fit.
     """
     key, value = "", raw
     for name, index in re.findall(r"([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", path):
@@ -156,7 +166,7 @@ def _follow(path: str, raw: Any, hint: Any) -> tuple[str, Any, Any]:
 
 @functools.cache
 def _hints_of(kind: type) -> dict[str, Any]:
-    """Return the type of each field; found by evaluating text, which takes milliseconds."""
+    """Return the type of each field; evaluating the annotations takes milliseconds."""
     return get_type_hints(kind, include_extras=True)
 
 
@@ -169,7 +179,7 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def check_ranges(file: str, config: msgspec.Struct) -> None:
-    """Check each number of a struct against the `Range` of its type hint, or ConfigError."""
+    """Raise ConfigError if a number of a struct is outside the `Range` of its type hint."""
     _check_ranges(file, "", config, type(config))
 
 

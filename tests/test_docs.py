@@ -101,7 +101,7 @@ def test_a_table_said_to_need_xrl_gains_is_wholly_an_input_of_the_gain_schedule(
     config = files.load(DEFAULT_CONFIG)
     inputs = set(inputs_of(config))
     text = DEFAULT_CONFIG.read_text(encoding="utf-8")
-    said = re.findall(r"^\[(\w+)\].*what changes here needs `xrl gains`", text, re.MULTILINE)
+    said = re.findall(r"^\[(\w+)\].*after any change here, run `xrl gains`", text, re.MULTILINE)
     assert said
     for section in said:
         fields = msgspec.structs.fields(getattr(config, section))
@@ -143,8 +143,8 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
 @pytest.mark.parametrize(
     ("page", "text"),
     [
-        ("logs.md", f"| below {host_watch.WARN:g} | warns in its log; again only once"),
-        ("logs.md", f"again only once {host_watch.CALM:g} were free"),
+        ("logs.md", f"| below {host_watch.WARN:g} | warns in its log; warns again only"),
+        ("logs.md", f"again only after at least {host_watch.CALM:g} were free"),
         ("logs.md", f"| back to {host_watch.RESUME:g} or more |"),
         ("logs.md", f"the same factors of {host_watch.RUN_DIR_MIN_MIB} MiB"),
         ("law.md", f"down to {CERTIFICATE.margin_min:g} (`certificate.margin_min`)"),
@@ -152,7 +152,7 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
             "law.md",
             f"down to {CERTIFICATE.onboard_margin_min:g} (`certificate.onboard_margin_min`)",
         ),
-        ("tutorial.md", f"The planner accepts down to {CERTIFICATE.margin_min:g};"),
+        ("tutorial.md", f"The planner accepts margins down to {CERTIFICATE.margin_min:g};"),
         ("simulator.md", f"| below {posture.FALLEN_HEIGHT:.2f} m;"),
         ("simulator.md", f"yaw, either way | over {posture.FALLEN_ANGLE:g} rad"),
         ("simulator.md", f"against the floor | over {posture.FALLEN_TILT:g} rad"),

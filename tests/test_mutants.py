@@ -90,7 +90,7 @@ def test_a_mutant_lives_only_for_a_reason_and_at_most_one_in_twenty_do() -> None
     code, text = judged(6, (LIVES,))
     assert (code, "at least 95%" in text) == (3, True)
     code, text = judged(0, (LIVES,))
-    assert (code, "listed, and does not live" in text) == (3, True)
+    assert (code, "listed, but does not survive" in text) == (3, True)
     assert judged(0, (LIVES,), sample=True)[0] == 0
 
 
@@ -98,4 +98,4 @@ def test_a_group_that_is_none_is_an_error_that_names_those_there(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert mutants.main(["--group", "nobody", "--out", str(tmp_path)]) == 2
-    assert "there are holding, joint, planner" in capsys.readouterr().out
+    assert "unknown; use one of holding, joint, planner" in capsys.readouterr().out

@@ -56,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             _tell("xrl: interrupted")
             return INTERRUPTED
-        except Exception:  # noqa: BLE001 - Python's own exit code would be 1: a robot that fell
+        except Exception:  # noqa: BLE001 - Python would exit with 1, which means a fallen robot
             bug = "xrl: this is a bug in xrl; please report the lines above"
             _tell(f"{traceback.format_exc()}{bug}")
             return BUG_EXIT_CODE
@@ -69,12 +69,12 @@ def _run(arguments: Sequence[str]) -> int:
     except SystemExit:
         sys.stdout.flush()
         raise
-    sys.stdout.flush()  # report a full disk here; at the interpreter's exit it prints a traceback
+    sys.stdout.flush()  # report a full disk here; at its exit Python would print a traceback
     return code
 
 
 def _with_values(arguments: Sequence[str]) -> list[str]:
-    """Join a flag and a list of numbers that begins with a minus: argparse takes it for a flag."""
+    """Join a flag and a list that begins with a minus sign, which argparse would read as a flag."""
     joined: list[str] = []
     for word in arguments:
         if joined and joined[-1].startswith("--") and _NEGATIVE_LIST.match(word):
@@ -182,7 +182,7 @@ def _refuse(parser: argparse.ArgumentParser, noun: str, word: str, begin: str) -
     if begin.startswith("-"):
         hint = f"{begin} comes after the verb; "
     asked, where = f"{noun} {word}".lstrip(), f"xrl {noun} --help".replace("  ", " ")
-    parser.error(f"no verb {asked[:40]!r}; {hint}`{where}` lists them")
+    parser.error(f"no verb {asked[:40]!r}; {hint}`{where}` lists all verbs")
 
 
 class _Version(argparse.Action):

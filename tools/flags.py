@@ -79,12 +79,12 @@ class Arg(NamedTuple):
     """Names of the flag; if empty, `--` and the field's name."""
     metavar: str = ""
     choices: tuple[str, ...] = ()
-    """Valid values from a table elsewhere; otherwise like a `Literal`."""
+    """Valid values, if they come from a table and not from a `Literal`."""
     parse: Callable[[str], Any] | None = None
-    """Parser of one value; its ValueError or argparse.ArgumentTypeError says what is valid."""
+    """Parser of one value; its argparse.ArgumentTypeError says what is valid."""
     is_positional: bool = False
     is_one: bool = False
-    """True if one word holds the whole tuple."""
+    """True if one argument contains the whole tuple."""
     exclusive: str = ""
     """Name of a group of flags that exclude each other."""
     one_of: str = ""
@@ -112,12 +112,12 @@ Run = Annotated[Path, positional("RUN", help=RUN_HELP)]
 
 
 def parsed(parse: Callable[[str], Any], metavar: str, **more: Any) -> Arg:
-    """Return a flag whose value is read by a function."""
+    """Return a flag whose value a function parses."""
     return Arg(metavar=metavar, parse=parse, **more)
 
 
 def names_of(known: Collection[str] = ()) -> Callable[[str], tuple[str, ...]]:
-    """Return a parser of names separated by commas, each once; an empty table allows any name."""
+    """Return a parser of distinct names, separated by commas; an empty `known` allows any name."""
 
     def parse(text: str) -> tuple[str, ...]:
         names = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
@@ -137,7 +137,7 @@ def numbers(count: int, like: str) -> Callable[[str], tuple[float, ...]]:
     def parse(text: str) -> tuple[float, ...]:
         words = text.replace(",", " ").split()
         if len(words) != count:
-            raise argparse.ArgumentTypeError(f"got {len(words)} numbers, expected {count}: {like}")
+            raise argparse.ArgumentTypeError(f"expected {count} numbers ({like}), got {len(words)}")
         found = []
         for word in words:
             try:
@@ -166,7 +166,7 @@ class _Field(NamedTuple):
 
 
 def fields_of(declaration: type[Flags]) -> Iterator[_Field]:
-    """Yield the fields, a verb's own first."""
+    """Yield the fields, a class's own before those of its bases."""
     hints = get_type_hints(declaration, include_extras=True)
     docs = field_docs(declaration)
     by_name = {field.name: field for field in dataclasses.fields(declaration)}  # type: ignore[arg-type]
@@ -350,12 +350,11 @@ class RunDirFlags(Flags):
     run_dir: Annotated[Path, parsed(own_directory, "DIR")] = dataclasses.field(
         default_factory=_own_run_dir
     )
-    """run directory, which identifies the fleet and holds its logs (default: $XRL_RUN_DIR, else
-    /tmp/xrl-UID)"""
+    """the fleet's run directory, with its logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID)"""
 
 
 class ConfigFlags(Flags):
-    """Robot file; the default is the one in the working directory."""
+    """Robot file of a verb."""
 
     config: Annotated[Path, parsed(places.config_argument, "FILE", help=places.HELP)] = (
         dataclasses.field(default_factory=places.robot_file)
@@ -363,7 +362,7 @@ class ConfigFlags(Flags):
 
 
 def robot_file_of(before: str) -> Arg:
-    """Return the flag for a robot file whose first default is `before`, ahead of the usual ones.
+    """Return the flag for a robot file, with `before` ahead of the usual defaults.
 
     The field is None if the flag is not given; the verb then calls `places.robot_file` itself.
     """
@@ -374,13 +373,13 @@ def robot_file_of(before: str) -> Arg:
 class FleetRobotFlags(RunDirFlags):
     """Fleet and robot file; by default the robot file of the running fleet, if there is one."""
 
-    config: Annotated[Path | None, robot_file_of("that of the fleet in --run-dir")] = None
+    config: Annotated[Path | None, robot_file_of("the fleet's")] = None
 
 
 class MotionFlags(FleetRobotFlags):
-    """Motion of the robot that is shown first and that a person must confirm."""
+    """Flags of a verb that shows its motions, and moves the robot once they are confirmed."""
 
     yes: bool = False
     """do not ask for confirmation"""
     dry_run: bool = False
-    """show the motions without moving anything"""
+    """show the motions, move nothing"""

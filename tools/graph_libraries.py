@@ -40,13 +40,13 @@ from tools.flags import ConfigFlags, add_flags, read_flags
 SAMPLES: Final = 200
 """Number of random arguments on which library and graph must agree."""
 DRAWN_MAX: Final = (0.3, 2.0)
-"""Largest random arguments, used in turn. With the first, most results are numbers; the second
+"""Largest random arguments, used in turn. With the first, most results are finite; the second
 covers the range of the joints."""
 _HELPERS_BEGIN: Final = '#pragma GCC push_options\n#pragma GCC optimize ("fp-contract=fast")\n'
 _HELPERS_END: Final = "/* Configuration this file was compiled with */\n"
-"""In the C code of a graph: the functions before this line are in CasADi's own library too."""
+"""Line in a graph's C code; the functions before it are also in CasADi's own library."""
 _HELPER: Final = re.compile(r"^(?=(?:void|int|casadi_int|casadi_real) casadi_\w+\()", re.MULTILINE)
-_NO_COMPILER: Final = "no C compiler `cc` on PATH: CasADi interprets the law's graphs, and all runs"
+_NO_COMPILER: Final = "no C compiler `cc` on PATH: CasADi interprets the graphs, more slowly"
 
 
 def command() -> str:
@@ -67,7 +67,7 @@ def graphs_of(robot: RobotConfig) -> list[ca.Function]:
 
 
 def build(function: ca.Function, folder: Path = FOLDER) -> Path:
-    """Translate a graph into C, compile it, compare the two, and keep the library."""
+    """Translate a graph into C, compile it, and keep the library if the results are the same."""
     compiler = shutil.which("cc")
     if compiler is None:
         raise RunError(_NO_COMPILER)
@@ -84,12 +84,13 @@ def translation(function: ca.Function) -> str:
     """Return a graph as C code.
 
     The interpreter computes operation by operation, but calls CasADi's library for matrix products
-    and similar. On Arm that library has fused multiply-adds, so the C code has them there too.
+    and similar operations. On Arm that library uses fused multiply-adds, so there the C code uses
+    them too.
     """
     code = ca.CodeGenerator(f"{function.name()}.c")
     code.add(function)
     helpers, end, own = code.dump().partition(_HELPERS_END)
-    helpers = _HELPER.sub("static ", helpers)  # GCC 14 applies the option only to static ones
+    helpers = _HELPER.sub("static ", helpers)  # GCC 14 applies the option only to static functions
     return f"{_HELPERS_BEGIN}{helpers}#pragma GCC pop_options\n{end}{own}"
 
 
@@ -113,7 +114,7 @@ def _build(function: ca.Function, compiler: str, path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Flush a file or folder to disk: half a library would crash every process that loads it."""
+    """Flush a file or folder to disk, because an incomplete library would crash its processes."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -136,7 +137,9 @@ def compare(function: ca.Function, translated: ca.Function) -> None:
                     "graph's; the library is not used"
                 )
     if finite < SAMPLES // 4:
-        raise RunError(f"{function.name()}: {finite} of {SAMPLES} results are finite: no proof")
+        raise RunError(
+            f"{function.name()}: cannot be compared: only {finite} of {SAMPLES} results are finite"
+        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:

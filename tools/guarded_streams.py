@@ -21,7 +21,7 @@ _CONTROL: Final = re.compile(
 )
 
 DRAWN: Final = "xrl-drawn"
-"""Name of the codecs' error handler that replaces what a terminal cannot draw."""
+"""Name of the error handler of `codecs` that replaces characters that a terminal cannot draw."""
 _ALIKE: Final = {"█": "#", "±": "+-", "…": "...", "µ": "u", "°": "deg", "→": "->"}
 
 
@@ -36,12 +36,12 @@ def is_clean(text: str) -> bool:
 
 
 def printable(text: str) -> str:
-    """Return a text from outside as part of one line."""
+    """Return a text on one line, with control characters escaped."""
     return cleaned(text).replace("\n", "\\n")
 
 
 class _Guarded:
-    """A stream that cleans printed text; Rich bypasses it, because it writes its own colours."""
+    """Stream that cleans printed text. Rich bypasses it, because Rich writes colour codes."""
 
     def __init__(self, stream: IO[str]) -> None:
         self.rich_proxied_file = stream
@@ -49,7 +49,7 @@ class _Guarded:
         self._lost: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write a text with its control characters shown."""
+        """Write a text with its control characters escaped."""
         try:
             self.rich_proxied_file.write(cleaned(text))
         except OSError as error:
@@ -58,7 +58,7 @@ class _Guarded:
         return len(text)
 
     def flush(self) -> None:
-        """Flush, and raise an error that the writer ignored, as argparse does."""
+        """Flush, and raise a write error that the caller ignored, as argparse does."""
         if self._lost is not None:
             raise self._lost
         self.rich_proxied_file.flush()

@@ -1,4 +1,4 @@
-"""Reads single key presses from a terminal; without a terminal there are none."""
+"""Single key presses from a terminal; none without a terminal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _READ_MAX: Final = 256
 
 
 class Keyboard(Generic[K]):
-    """Waits, and returns early when a key is pressed; restores the terminal at the end."""
+    """Reader of single keys, which restores the terminal at the end."""
 
     def __init__(self, codes: Mapping[bytes, K]) -> None:
         self._codes = codes
@@ -33,7 +33,7 @@ class Keyboard(Generic[K]):
         return self._descriptor >= 0
 
     def __enter__(self) -> Self:
-        """Read single keys, if this process is in the foreground of a terminal."""
+        """Start to read single keys, if this process is in the foreground of a terminal."""
         try:
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor) and _is_foreground(descriptor):
@@ -58,7 +58,7 @@ class Keyboard(Generic[K]):
             self._descriptor = -1
 
     def wait(self, timeout_s: float) -> list[K]:
-        """Return the pressed keys, at the latest after a timeout, s."""
+        """Return the pressed keys as soon as there is one, or none after a timeout, s."""
         if not self.present:
             time.sleep(timeout_s)
             return []

@@ -1,4 +1,4 @@
-"""Helpers for verbs that print or write files."""
+"""Helpers for verbs that show progress or write files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EXPORTED: Collection[str] = (".csv", ".mcap", ".yaml")
 
 @contextlib.contextmanager
 def progress_along(what: str, length_s: float) -> Iterator[Callable[[float], None]]:
-    """Show the progress of a run on a terminal; call the callable with the run's time, s."""
+    """Show progress on a terminal; yield a function that receives the run's time reached, s."""
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as shown:
         bar = shown.add_task(what, total=length_s)
@@ -45,7 +45,7 @@ def make_folder(out: Path | None, verb: str) -> Path:
 
 
 def refuse_taken(out: Path, record: Path, *, force: bool) -> None:
-    """Refuse an output that is the record itself or, without `--force`, that exists.
+    """Refuse an output that is the record itself or, without `force`, exists already.
 
     Raises:
         RunError: with the reason.
@@ -60,7 +60,10 @@ def refuse_taken(out: Path, record: Path, *, force: bool) -> None:
 def whole_folder(out: Path, record: Path, *, force: bool) -> Iterator[Path]:
     """Yield a path inside a temporary folder, and move the whole folder to `out` at the end.
 
-    With `force` an earlier export is replaced. Anything else is never replaced (RunError).
+    With `force`, an earlier export at `out` is replaced. Anything else there is refused.
+
+    Raises:
+        RunError: with the reason.
     """
     out, source = out.resolve(), record.resolve()
     if source.is_relative_to(out):
@@ -76,7 +79,8 @@ def whole_folder(out: Path, record: Path, *, force: bool) -> Iterator[Path]:
             out.replace(aside / "before")
         (aside / out.name).replace(out)
     except OSError as error:
-        raise RunError(f"{out}: cannot write it: {error.strerror or error}") from None
+        why = error.strerror or error
+        raise RunError(f"{out}: cannot write it: {why}; choose another folder") from None
     finally:
         shutil.rmtree(aside, ignore_errors=True)
 

@@ -1,7 +1,7 @@
-"""Offline solver for a stand from any configuration, or for the nearest one within reach.
+"""Offline solver for a stand at a requested pose p_ref, from any configuration.
 
-Levenberg-Marquardt inside the joint limits, from several starts. If p_ref is out of reach, it ends
-at the nearest pose at which the legs still agree, and reports what limits it.
+It runs Levenberg-Marquardt inside the joint limits, from several starts. If p_ref is out of reach,
+it returns the nearest pose at which the legs agree, and the limits that stop it.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from shared.arrays import Array
 from shared.joints import JOINTS, N_JOINTS, N_LEG
 
 COLD_STEP_MAX = 0.5
-"""rad; longer than `STEP_MAX`, because here a step that does not reduce the cost is undone."""
+"""Maximum step, rad; larger than `STEP_MAX`, because a step without enough gain is undone here."""
 EVALUATIONS_MAX = 60
 """Evaluations of the kinematics per start; from a bent stand the median is 8."""
 CLOSURE_WEIGHT = 10.0
-"""Weight of the closure relative to p, where both cannot be met; the shift removes the rest."""
+"""Weight of the closure error relative to the error of p; `shift` removes the remaining one."""
 CLOSING_ROUNDS = 5
 """Rounds of the multiplier method; each reduces the closure error about a hundredfold."""
 STATIONARY = 1e-3
-"""Fraction of the error; joint gradients below it count as zero."""
+"""Joint gradients up to this fraction of the largest error count as zero."""
 EQUAL_SHARING: Array = 0.5 * np.eye(6)
 """Load sharing (6, 6) for a cold start: the same at every q, so that J is exactly dp/dq."""
 POSE_ROWS = (
@@ -42,11 +42,11 @@ POSE_ROWS = (
 
 
 class IkEnding(IntEnum):
-    """Ending of a solve."""
+    """Outcome of a solve."""
 
     CONVERGED = 0
     JOINT_LIMIT = 1
-    """The nearest pose inside the joint limits."""
+    """The nearest pose inside the joint limits; at least one limit prevents a nearer one."""
     OUT_OF_REACH = 2
     """The nearest pose that the legs reach; no joint limit stops them."""
     UNFINISHED = 3
@@ -58,9 +58,9 @@ class Reach(NamedTuple):
 
     outcome: IkEnding
     error: Array
-    """p_ref - p (6,), m and rad: the missed rows, with sign."""
+    """p_ref - p (6,), m and rad."""
     closure: float
-    """Largest difference between the legs' estimates of the torso, m or rad."""
+    """Largest difference between the legs' estimates of the torso's pose, m or rad."""
     stopped: tuple[int, ...]
     """Per joint (12): +1 if pressed against its upper limit, -1 if against its lower, else 0."""
     evaluations: int
@@ -78,13 +78,13 @@ class ReachSolver(InverseKinematics):
     _evaluations = 0
 
     def solve_from_anywhere(self, p_ref: Array) -> Reach:
-        """Improve `q` as far as possible inside the joint limits, from any configuration.
+        """Move `q` as close to p_ref as the joint limits permit, from any configuration.
 
-        The solver starts at `q`, then at bent stands with the requested pitch, then with one knee
-        twisted. Near the top of the workspace some poses lie beyond a fold that no descent from a
-        stand crosses. If no start reaches p_ref, `q` is the nearest pose found at which the legs
-        agree. Nothing is random. Not meant for every tick: out of reach it takes several hundred
-        evaluations.
+        Until p_ref is reached, the solver starts at `q`, then at bent stands with the requested
+        pitch, then at stands with one knee twisted. Near the top of the workspace some poses lie
+        beyond a fold that no descent from a stand crosses. If no start reaches p_ref, `q` is the
+        nearest pose found at which the legs agree. The result is deterministic. Not for every tick:
+        if p_ref is out of reach, a solve takes several hundred evaluations.
 
         Args:
             p_ref: (6,), m and rad.
@@ -100,7 +100,7 @@ class ReachSolver(InverseKinematics):
             if float(np.abs(self._error).max()) <= TOLERANCE:
                 break
         else:
-            # from `initial` too: the nearest pose with the legs apart may not be the closed one
+            # also from `initial`: the nearest pose may have legs that disagree by far
             found = [self._nearest_closed(p_ref, start) for start in (nearest, initial)]
             self.q[:] = min(found, key=lambda one: one[0])[1]
         return self.examine(p_ref)
@@ -199,7 +199,7 @@ def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
     Args:
         reach: result of a solve for p_ref.
         p_ref: (6,), m and rad.
-        limits: of the joints (12, 2), rad.
+        limits: joint limits (12, 2), rad.
     """
     if reach.converged:
         return "p_ref is reached"

@@ -33,7 +33,7 @@ _FIELD: Final = re.compile(r"\{(?:![rs])?(?::[^{}]*)?\}")
 
 
 def marked(template: str, *values: object) -> Text:
-    """Return a text in which only the template is parsed as markup."""
+    """Return the template with the values filled in; only the template is parsed as markup."""
     whole = Text()
     given = zip(_FIELD.findall(template), values, strict=True)
     frame = Text.from_markup(_FIELD.sub(_HOLE, template), emoji=False)
@@ -49,7 +49,7 @@ def marked(template: str, *values: object) -> Text:
         part.right_crop(1)
         whole.append_text(part)
         whole.append_text(filling)
-    next(given, None)  # raises if there is a value too many
+    next(given, None)  # raises if there are too many values
     return whole
 
 

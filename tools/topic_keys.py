@@ -50,14 +50,17 @@ def _is_named(key: TopicKey, name: str) -> bool:
 
 
 def keys_named(names: Sequence[str], left_out: Collection[Topic] = ()) -> list[TopicKey]:
-    """Return the keys that match one of these names, in the order of the table of topics."""
+    """Return the keys that match one of these names, in the order of the table of topics.
+
+    Without names, return all keys except those of the topics `left_out`.
+    """
     known = every_key()
     for name in names:
         if not any(_is_named(key, name) for key in known):
             rows = ", ".join(topic.name for topic in topics.TOPICS)
             raise RunError(
-                f"{name}: no topic has this name; the topics are {rows}; * stands for a part "
-                "between slashes, ** for slashes too"
+                f"{name}: no topic has this name; the topics are {rows}; * stands for any "
+                "part between slashes, ** also for text with slashes"
             )
     if not names:
         return [key for key in known if key.topic not in left_out]

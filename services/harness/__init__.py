@@ -1,1 +1,1 @@
-"""Harness service: six leg forces in, the operator's wrench out (docs/law.md#harness)."""
+"""Harness service: computes the operator's wrench from six leg forces (docs/law.md#harness)."""

@@ -24,7 +24,7 @@ def main() -> int:
 
 
 def made(config: RobotConfig, run_dir: Path) -> SensorService:
-    """Return the service of the robot's sensor; ConfigError if its geometry is singular."""
+    """Return the service of the robot's sensor; raise ConfigError if its geometry is singular."""
     harness = config.harness
     sensor = sensor_of(config, harness, SampleAssembler(), run_dir)
     law = WrenchFilter(harness)

@@ -1,17 +1,15 @@
-"""Wrench and its validity from leg forces: tare, low-pass, saturation, staleness.
+"""Compute the wrench and its validity from leg forces (docs/law.md#harness). Pure.
 
-Pure: state, time and sample in, next state and reading out (docs/law.md#harness).
-
-- *Tare*: the mean leg forces over `tare_s` become the zero. A saturated cell, a gap longer than
-  `stale_ms`, or forces that move too much restart the tare. No wrench is valid until it is done. A
-  load at rest cannot be distinguished from a zero.
+- *Tare*: the mean leg forces over `tare_s` become the zero. A saturated or frozen cell, a gap
+  longer than `stale_ms`, or forces that vary too much restart the tare. No wrench is valid before
+  the tare is done. A constant load during the tare becomes part of the zero.
 - *Low-pass*: first order at `low_pass_hz`, exact for any time between samples. The weight of a
   new sample therefore grows with the gap before it.
 - *Saturation*: a sample with any raw leg force at or beyond `leg_force_max` is not used.
 - *Staleness*: a sample is fresh while its age is at most `stale_ms`.
-- *Frozen*: a working cell has noise. No wrench is valid while a cell has repeated its reading for
-  `FROZEN_NS`: the amplifier hangs, a wire is off, or the bus repeats its last frame.
-- A sample with a number that is not finite is refused and counted.
+- *Frozen*: no wrench is valid while a cell has repeated its reading for `FROZEN_NS`. A working cell
+  is noisy; a hung amplifier, a loose wire or a bus that repeats its last frame is not.
+- *Not finite*: a sample with a number that is not finite is refused and counted.
 """
 
 from __future__ import annotations
@@ -34,14 +32,14 @@ Array = npt.NDArray[np.float64]
 _ZERO: Final[Array] = np.zeros(N_LEGS)
 
 FROZEN_NS: Final = 100 * NS_PER_MS
-"""ns; 25 samples."""
+"""Time without change after which a cell counts as frozen, ns: 25 samples."""
 NEVER_NS = -1
-"""Time of an event that has not happened."""
+"""Value of a time whose event has not happened yet."""
 
 
 TARE_DEVIATION_MAX: Final = 3.0
-"""Maximum standard deviation of a leg force in a tare, N: several times a cell's noise, and less
-than a hand on the harness or a swaying robot causes."""
+"""Maximum standard deviation of a leg force during a tare, N: several times a cell's noise, and
+less than a hand on the harness or a swaying robot causes."""
 
 
 class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
@@ -55,29 +53,29 @@ class FilterState(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """Time of the first sample of the tare; `NEVER_NS` before it."""
     tare_count: int = 0
     tare_first: Array = _ZERO
-    """(6,) raw leg forces of that sample, N: near the mean, so that squares stay small."""
+    """(6,) raw leg forces of the first sample, N. The sums are relative to it, to stay small."""
     tare_sum: Array = _ZERO
-    """(6,) sum of the raw leg forces since then, minus `tare_first`, N."""
+    """(6,) sum of the differences between raw leg forces and `tare_first`, N."""
     tare_squares: Array = _ZERO
     """(6,) sum of the squares of these differences, N^2."""
     offset: Array = _ZERO
-    """(6,) leg forces that count as zero, N."""
+    """(6,) zero of the leg forces, N."""
     wrench: Array = _ZERO
-    """(6,) last good wrench after the low-pass, [N; N m]."""
+    """(6,) last valid wrench after the low-pass, [N; N m]."""
     wrench_t_ns: int = NEVER_NS
-    """Time of the last sample in that wrench."""
+    """Time of the last sample that `wrench` includes."""
     sample_t_ns: int = NEVER_NS
     """Time of the newest finite sample; `NEVER_NS` before the first."""
     raw: Array = _ZERO
-    """(6,) leg forces of that sample, N."""
+    """(6,) leg forces of the newest finite sample, N."""
     changed_ns: Array = _ZERO
-    """(6,) times at which each of them last changed."""
+    """(6,) time of the last change of each leg force, ns."""
     frozen: bool = False
-    """True if one of them has not changed for `FROZEN_NS`."""
+    """True if a leg force has not changed for `FROZEN_NS`."""
     saturated: bool = False
-    """True if a leg of that sample was saturated."""
+    """True if a leg force of the newest finite sample was saturated."""
     refused: int = 0
-    """Samples that were not finite."""
+    """Number of samples that were not finite."""
 
 
 class FilteredWrench(msgspec.Struct, frozen=True, gc=False, kw_only=True):
@@ -86,31 +84,31 @@ class FilteredWrench(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     wrench: Array
     """(6,) [force in N; moment in N m], torso axes, about the harness point."""
     valid: bool
-    """True if fresh, not saturated, not frozen and tared; otherwise the wrench is the last good
-    one."""
+    """True if fresh, not saturated, not frozen and tared; otherwise `wrench` is the last valid
+    wrench."""
     saturated: bool
     age_ns: int
     """Age of the newest finite sample; -1 before the first."""
 
 
 def tared_state(offset: Array) -> FilterState:
-    """Return the state of a sensor whose tare found these leg forces (6,), N, as zero."""
+    """Return the state of a sensor that is tared with the zero `offset` (6,), N."""
     return FilterState(tare=Tare.DONE, offset=offset)
 
 
 def start_tare(state: FilterState) -> FilterState:
-    """Return the state with the tare started, unless it runs already."""
+    """Return the state with a new tare started; unchanged while a tare runs."""
     return state if state.tare is not Tare.DONE else _begin_tare(state, Tare.RUNNING)
 
 
 class WrenchFilter:
-    """Constants of the filter, and its step."""
+    """Filter of the leg forces, with its constants."""
 
     def __init__(self, config: HarnessConfig) -> None:
-        """Derive the constants; ConfigError if the sensor's geometry is singular."""
+        """Derive the constants; raise ConfigError if the sensor's geometry is singular."""
         self._G = geometry_matrix(config.base_radius, config.platform_radius, config.height)
         self._cutoff = 2.0 * math.pi * config.low_pass_hz  # rad/s
-        # A cell at the end of its range reads this after its trip through float32.
+        # The frames round a cell's largest reading to this float32.
         self._force_limit = as_sent(config.leg_force_max)
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
         self._tare_ns = round(config.tare_s * NS_PER_S)
@@ -118,7 +116,7 @@ class WrenchFilter:
     def step(
         self, state: FilterState, now_ns: int, forces: Vector6 | None
     ) -> tuple[FilterState, FilteredWrench]:
-        """Add the newest leg forces, N, or None without a sample; return state and reading."""
+        """Process the newest leg forces, N; None without a new sample. Return state and reading."""
         if forces is not None:
             state = self._add(state, now_ns, forces)
         seen = state.sample_t_ns != NEVER_NS

@@ -1,4 +1,4 @@
-"""The loop of the harness service: read, tare on request, filter, publish."""
+"""Loop of the harness service: reads the sensor, tares on request, filters and publishes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from shared.run_directory import live_dir, mapped
 
 
 class HarnessLoop(SensorLoop[Vector6, Wrench]):
-    """Loop of the service; starts with a tare, or with the zero of the service before it."""
+    """Loop that starts with a tare, or with the zero that the previous service stored."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
     def message(self, now_ns: int, sample: Vector6 | None) -> Wrench:
         """Tare on request and filter the leg forces, N; return the wrench in torso axes.
 
-        The sensor is fixed to the torso.
+        The sensor is fixed to the torso, so no rotation is needed.
         """
         if self._requests.take() is not None:
             self.state = start_tare(self.state)
@@ -66,20 +66,20 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
 
 
 _KEPT: Final = struct.Struct(f"<{N_LEGS}dI")
-"""Leg forces, N, and a checksum over boot id and forces, because a kill may interrupt a write."""
+"""Zero of the leg forces, N, and a checksum over boot id and zero: a kill may interrupt a write."""
 _BOOT: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
 def zero_path(run_dir: Path) -> Path:
-    """Return the path of the stored zero."""
+    """Return the path of the file with the zero."""
     return live_dir(run_dir) / "harness.zero"
 
 
 class ZeroFile:
-    """File with the last zero of this fleet's harness."""
+    """File with the latest zero of this fleet's harness, valid until the host restarts."""
 
     def __init__(self, run_dir: Path, boot: bytes | None = None) -> None:
-        """Open or create the file; the directory must exist. `boot` identifies the host's boot.
+        """Open or create the file; the directory must exist. `boot` is the id of the host's boot.
 
         Raises:
             FleetError: the file cannot be created.
@@ -88,7 +88,7 @@ class ZeroFile:
         self._boot = _BOOT.read_bytes() if boot is None else boot
 
     def read(self) -> Array | None:
-        """Return the leg forces (6,) that count as zero, N; None if no tare is stored."""
+        """Return the stored zero (6,), N; None if the file has no valid zero."""
         *forces, checksum = _KEPT.unpack(self._memory[:])
         offset = np.array(forces)
         return offset if checksum == self._checksum(offset) else None

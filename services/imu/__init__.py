@@ -1,1 +1,1 @@
-"""IMU service: the sensor's orientation in, the up direction out."""
+"""IMU service: computes the up direction from the sensor's orientation."""

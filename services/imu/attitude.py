@@ -1,12 +1,12 @@
-"""Unit vector up in torso axes, from the IMU's orientation. Pure.
+"""Compute the up direction, a unit vector in torso axes, from the IMU's orientation. Pure.
 
-The quaternion turns sensor axes into axes whose z is up. The third row of its rotation is thus up
-in sensor axes; the heading, which is wrong near steel, drops out. The mounting turns sensor axes
-into torso axes.
+The quaternion rotates sensor axes to world axes with z up, so the third row of its rotation is up
+in sensor axes. The heading, which is wrong near steel, has no effect. The mounting rotates sensor
+axes to torso axes.
 
-A sample whose quaternion is not of unit length is refused and counted, because its frames have
-another meaning. A working sensor has noise, so no reading is valid once samples have been the same
-for `FROZEN_NS`.
+A sample whose quaternion is not of unit length is refused and counted, because its frames must have
+another format. A working sensor is noisy, so no reading is valid once samples have not changed for
+`FROZEN_NS`.
 """
 
 from __future__ import annotations
@@ -25,29 +25,30 @@ UNIT_TOLERANCE: Final = 0.02
 
 
 FROZEN_NS: Final = 250 * NS_PER_MS
-"""ns; longer than for a load cell, because an IMU's readings are coarser: 3e-5 and 2e-3 rad/s."""
+"""Time without change after which the sensor counts as frozen, ns. It is longer than a load cell's,
+because an IMU's steps are coarser: 3e-5 in the quaternion, 2e-3 rad/s in the rates."""
 
 
 class AttitudeReading(NamedTuple):
     """Output of the attitude filter."""
 
     up: Vector3
-    """Unit vector against gravity, torso axes."""
+    """Unit vector opposite to gravity, torso axes."""
     rate: Vector3
-    """rad/s, torso axes."""
+    """Angular velocity, rad/s, torso axes."""
     valid: bool
-    """True if fresh, not frozen, and valid according to the sensor; otherwise the numbers are the
-    last good ones."""
+    """True if fresh, not frozen, and valid according to the sensor; otherwise `up` and `rate` are
+    the last valid values."""
     age_ns: int
-    """Age of the newest sample; -1 before the first."""
+    """Age of the newest accepted sample; -1 before the first."""
 
 
 class AttitudeLaw:
-    """Mounting, last good sample and its age."""
+    """Filter of the attitude; stores the mounting and the last valid values."""
 
     def __init__(self, config: ImuConfig) -> None:
         self.refused = 0
-        """Samples whose quaternion was not of unit length."""
+        """Number of samples whose quaternion was not of unit length."""
         self._mounting = torso_rotation(config.mounting)
         self._stale_ns = round(config.stale_ms * NS_PER_MS)
         self._up: Vector3 = (0.0, 0.0, 1.0)
@@ -58,7 +59,7 @@ class AttitudeLaw:
         self._changed_ns = 0
 
     def step(self, now_ns: int, sample: ImuSample | None) -> AttitudeReading:
-        """Add the newest sample, or None without a sample; return the reading."""
+        """Process the newest sample, or None if there is none; return the reading."""
         if sample is not None and not _is_unit(sample.quaternion):
             self.refused += 1
             sample = None

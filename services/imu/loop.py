@@ -1,4 +1,4 @@
-"""The loop of the IMU service: read, compute the up direction, publish."""
+"""Loop of the IMU service: reads the sensor, computes the up direction and publishes it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.can.sensor_loop import Sensor, SensorLoop
 
 
 class ImuLoop(SensorLoop[ImuSample, Attitude]):
-    """Loop of the service."""
+    """Loop of the IMU service."""
 
     def __init__(
         self, sensor: Sensor[ImuSample], law: AttitudeLaw, publisher: Outbox[Attitude]
@@ -24,6 +24,6 @@ class ImuLoop(SensorLoop[ImuSample, Attitude]):
         return self._law.refused
 
     def message(self, now_ns: int, sample: ImuSample | None) -> Attitude:
-        """Return the vector up and the rates."""
+        """Return the message with the up direction and the angular velocity."""
         reading = self._law.step(now_ns, sample)
         return Attitude(t_ns=now_ns, seq=self.cycles, **reading._asdict())

@@ -1,4 +1,4 @@
-"""`python -m services.joint MODULE`: the service of one module."""
+"""`python -m services.joint MODULE`: runs the joint service of one module."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from shared.process import (
 
 
 def main() -> int:
-    """Wire the controller to its drive and the bus and run it."""
+    """Connect the controller to its drive and the bus, and run it."""
     parser = service_parser(
         "Control one 2-DOF module.", "python -m services.joint ankle_right --run-dir /tmp/xrl"
     )
@@ -41,7 +41,7 @@ def main() -> int:
     parser.add_argument(
         "--readonly",
         action="store_true",
-        help="read the drive and publish its state, without commanding it: for bring-up",
+        help="read the drive and publish its state, but send it no commands; for bring-up",
     )
     arguments = parser.parse_args()
     module: str = arguments.module
@@ -61,7 +61,7 @@ def main() -> int:
         drive = open_drive(robot, module, arguments.run_dir, read_only=arguments.readonly)
         rearm_guard = None if arguments.readonly else RearmGuard(arguments.run_dir, module)
         if rearm_guard is not None:
-            rearm_guard.stop_on(signal.SIGUSR1)  # also works when the file's disk is gone
+            rearm_guard.stop_on(signal.SIGUSR1)  # works even if the file's disk is gone
         last_state = LastState.NOTHING if rearm_guard is None else rearm_guard.read()
         neighbours = None if arguments.readonly else Neighbours(arguments.run_dir, module)
         loop = JointLoop(
@@ -77,7 +77,7 @@ def main() -> int:
 
 
 def open_drive(robot: RobotConfig, module: str, run_dir: Path, *, read_only: bool = False) -> Drive:
-    """Return the module's drive, on its CAN bus or on USB, in turns from the joint's zero."""
+    """Return the module's drive, on CAN or USB; positions are in turns from the joint's zero."""
     frame = MotorFrame(robot.drive.zero_mark_turns, robot.module_named(module).motor_signs)
     return WiredDrive(_open(robot, module, run_dir), frame, read_only=read_only)
 

@@ -53,11 +53,11 @@ class ControllerState(msgspec.Struct, kw_only=True):
     failsafe: Failsafe = msgspec.field(default_factory=Failsafe)
     trips: JointTrips = msgspec.field(default_factory=JointTrips)
     initial_torque: Pair | None = None
-    """Torque of a drive that was found armed, N m; it is taken over without a step."""
+    """Torque of a drive that was found armed, N m; the take-over starts from it."""
     takeover_offset: Pair = (0.0, 0.0)
     """Drive's torque minus the law's when the service resumed after a gap, N m."""
     lately: Lately = NOTHING_YET
-    """Drift and energy of the accepted commands, up to the newest."""
+    """Accumulated drift and energy of the accepted commands."""
     resumed_ns: int = 0
     last_cycle_ns: int = 0
     cause: int = 0
@@ -66,7 +66,7 @@ class ControllerState(msgspec.Struct, kw_only=True):
     """Joint torque of the last cycle (phi, theta), N m."""
     cycle: int = 0
     late: int = 0
-    """Cycles that came more than two periods after the previous one."""
+    """Number of cycles that started more than two periods after the previous one."""
     clock: SampleClock = msgspec.field(default_factory=SampleClock)
     events: int = 0
     states: int = 0
@@ -78,12 +78,11 @@ class JointController:
     """Control law of one module; everything that changes between cycles is in `ControllerState`.
 
     Attributes:
-        timing: times of the age rule.
+        timing: times and limits of the failsafe.
         heat: estimate of the motors' temperatures.
     """
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Read the module's limits and gains."""
         service = config.joint_service
         self.timing = timing_of(config)
         self._envelope = Envelope(config, module)
@@ -116,7 +115,7 @@ class JointController:
         flushing: bool = False,
         near: NeighbourView = UNKNOWN,
     ) -> CycleResult:
-        """Run one cycle: estimate, age rule, mode, setpoint, limits.
+        """Run one cycle: estimate, age rule, mode, setpoint and limits.
 
         Args:
             s: the module's state, updated in place.
@@ -124,7 +123,7 @@ class JointController:
             reading: the drive's newest sample, or None if it did not arrive in time.
             command: the newest command since the last cycle, or None.
             estop: True if the emergency stop is engaged.
-            flushing: True while the link's buffer is read out after the service was frozen; samples
+            flushing: True while the link's buffer is emptied after the service was frozen; samples
                 may jump from the joint's old position to its present one.
             near: view of the other modules on this host.
         """
@@ -151,10 +150,10 @@ class JointController:
         return CycleResult(s.tau, event)
 
     def resume(self, s: ControllerState, now_ns: int, carried: Pair) -> Pair:
-        """Continue from the drive's torque after a gap without commands to it.
+        """Continue from the drive's torque after a gap in which the drive received no commands.
 
-        The difference to the law's torque fades over `joint_service.blend_ms`. Returns the joint
-        torque of this cycle, N m: the drive's, within the differential's limit.
+        The difference between this torque and the law's fades over `joint_service.blend_ms`.
+        Returns the joint torque of this cycle, N m: the drive's, limited by `limit_differential`.
 
         Args:
             s: the module's state, updated in place.
@@ -168,7 +167,7 @@ class JointController:
         return s.tau
 
     def is_state_due(self, s: ControllerState) -> bool:
-        """Return True if this cycle sends a state: every nth does, in the planner's phase."""
+        """Return True if a state is due: in every nth cycle, at the phase the planner requests."""
         return s.clock.passed(self._state_every, self._state_phase(s))
 
     def _state_phase(self, s: ControllerState) -> int:
@@ -178,7 +177,8 @@ class JointController:
     def state(self, s: ControllerState, now_ns: int) -> JointState:
         """Return the module's state message.
 
-        Its stamp is the arrival of the drive's sample, so a command made from an old sample is old.
+        Its stamp is the arrival time of the drive's sample, so a command that was computed from an
+        old sample counts as old.
         """
         failsafe, estimate, command = s.failsafe, s.estimate, s.failsafe.command
         s.states += 1
@@ -286,7 +286,7 @@ class JointController:
         self.heat.advance(s.heat, now_ns, motor_torque(s.tau, self._gear_ratio), fet, motor)
 
     def _wanted(self, s: ControllerState, now_ns: int, setpoint: Setpoint) -> Pair:
-        """Return the law's torque, N m, plus what is left of the take-over's offset."""
+        """Return the law's torque plus the rest of the take-over's offset, N m."""
         wanted = pd_law.torque(setpoint, s.estimate.q, s.estimate.v)
         if s.takeover_offset == pd_law.ZERO:
             return wanted

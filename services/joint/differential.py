@@ -1,11 +1,11 @@
 """The differential between two motors and a module's two axes (docs/law.md#the-robot).
 
-q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N, in turns at the motors. Power is the
-same on both sides, so tau_1 = (tau_theta + tau_phi) / 2N, tau_2 = (tau_theta - tau_phi) / 2N.
+q_phi, q_theta = (m1 - m2) / 2N, (m1 + m2) / 2N, with motor positions m1, m2. Power is the same on
+both sides, so tau_1 = (tau_theta + tau_phi) / 2N, tau_2 = (tau_theta - tau_phi) / 2N.
 
-The last step before the drive bounds the torque and its rate, in this order: a one-sided spring at
-the soft stop, a check for finite values, the rate limit, and last the torque diamond |tau_phi| +
-|tau_theta| <= tau_module_max, which nothing may exceed. Pure.
+The final limiter here bounds the torque and its rate. It applies a one-sided spring at the soft
+stop, a check for finite values, the rate limit, and finally the torque diamond |tau_phi| +
+|tau_theta| <= tau_module_max. Pure.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def limit_torque(tau: Pair, q: Pair, tau_last: Pair, limits: TorqueLimits) -> Pa
     """Return the torque that may go to the drive, N m.
 
     Args:
-        tau: requested (tau_phi, tau_theta), N m; may be anything, also NaN.
+        tau: requested (tau_phi, tau_theta), N m; any value, even NaN.
         q: measured (phi, theta), rad.
         tau_last: torque sent in the last cycle, N m.
         limits: the module's limits.

@@ -2,7 +2,7 @@
 
 The manager arms the drive, takes over a drive that still holds from an earlier service, idles a
 drive that disarmed, and chooses between torques and targets for the onboard loop. The joint loop
-sends its command to a real drive, and in lockstep to an emulated one. Pure.
+sends the manager's command to the drive; lockstep emulates the drive. Pure.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from shared.config.robot_config import RobotConfig
 ARM_EVERY_NS: Final = 500 * NS_PER_MS
 """Time between two attempts to arm while DISARMED, ns."""
 FORGET_EVERY_NS: Final = 150 * NS_PER_MS
-"""Time from idling the drive to the command to clear its zero, and between repetitions until it is
-cleared, ns. A heartbeat must first show that both axes are idle: an armed axis would jump."""
+"""Time from idling the drive to clearing its zero, and between repeated attempts, ns. A heartbeat
+must first show that both axes are idle, because an armed axis would jump."""
 IDLE_EVERY_NS: Final = 500 * NS_PER_MS
-"""Time between two idle commands to a drive with one disarmed axis, ns; the other axis keeps its
-torque."""
+"""Period of idle commands to the drive of a module in FAULT, ns: if one axis disarms, the other
+keeps its torque until it is idled."""
 GAP_NS: Final = 20 * NS_PER_MS
-"""Time without a cycle after which the service was frozen and its drive had no commands, ns."""
+"""Time between two cycles above which the service was frozen and its drive got no commands, ns."""
 LISTEN_NS: Final = 10 * NS_PER_MS
-"""Time after such a gap in which the service only reads, ns: buffered messages are old."""
+"""Time after a gap in which the service only reads, ns, because buffered messages are old."""
 ARM_TRIES: Final = 10
-"""Maximum number of requests to arm; after that a person must find the cause."""
+"""Maximum number of attempts to arm; after that a person must find the cause."""
 
 
 class DriveCommand(Enum):
@@ -62,9 +62,9 @@ class ArmingInhibit(Enum):
     WAITING = 5
     """The drive holds with its own loop; the service takes it over once a planner runs."""
     FAILED = 6
-    """The drive has errors: the service clears them, and arms it later if they stay away."""
+    """The drive has errors: the service clears them, and arms it later if they do not return."""
     UNACKNOWLEDGED = 7
-    """Its CAN bus carries no frame, because no node acknowledges any."""
+    """No node acknowledges a frame on the drive's CAN bus."""
 
 
 class DriveAction(msgspec.Struct, gc=False, frozen=True):
@@ -97,7 +97,7 @@ _NO_INHIBIT: Final = ArmingInhibit.NONE
 
 
 class Phase(Enum):
-    """Progress of this service in taking charge of its drive."""
+    """Progress of this service in taking control of its drive."""
 
     NEW = 0
     """The service has not acted yet: if the drive is armed, another service armed it."""
@@ -125,7 +125,7 @@ class DriveManagerState(msgspec.Struct, kw_only=True):
     forgets: bool = False
     """True if the drive's zero must be cleared when its position is lost."""
     forget_at_ns: int = 0
-    """Time of the next command to clear it, ns; 0 until the drive was idled."""
+    """Time of the next command to clear the zero, ns; 0 until the drive is idled."""
     forgot: bool = False
     target: MotorTarget | None = None
     """The last target sent to the drive."""
@@ -133,7 +133,7 @@ class DriveManagerState(msgspec.Struct, kw_only=True):
     listen_until_ns: int = 0
     """End of flushing the link after a gap, ns; 0 without a gap."""
     last_state: LastState = LastState.NOTHING
-    """For the next service, in case this one dies now."""
+    """Last state of this service, for the next one, in case this one dies now."""
 
 
 class DriveManager:
@@ -142,7 +142,7 @@ class DriveManager:
     Attributes:
         controller: the control law.
         state: everything that changes from cycle to cycle. A snapshot is a copy of it
-            (`shared.state.copied`); another manager that gets the copy continues bit for bit.
+            (`shared.state.copied`); a manager that starts from it continues bit for bit.
         bus: name of the module's CAN bus.
         onboard: True if the motors' own loops hold the module.
     """
@@ -175,7 +175,7 @@ class DriveManager:
 
     @property
     def leaves_holding(self) -> bool:
-        """True if the drive keeps holding with its own loop when the service ends now."""
+        """True if the drive would keep holding with its own loop if the service ended now."""
         s = self.state
         mode, lost = s.controller.failsafe.mode, s.controller.cause == Cause.DRIVE_LOST
         holds = mode in (Mode.HOLD, Mode.TRACK, Mode.DAMP) or (mode is Mode.FAULT and lost)
@@ -189,7 +189,7 @@ class DriveManager:
         estop: bool,
         near: NeighbourView = UNKNOWN,
     ) -> DriveAction:
-        """Run one cycle; arguments as for `JointController.step`; `estop` latches."""
+        """Run one cycle. Arguments are as in `JointController.step`; `estop` latches."""
         s, controller = self.state, self.controller
         s.estop = s.estop or estop
         if s.phase is not _OURS and reading is not None and reading.status is _ARMED:
@@ -236,7 +236,7 @@ class DriveManager:
         return DriveAction(result.event, out, torque, target, inhibit or _NO_INHIBIT)
 
     def _resumed(self, now_ns: int, result: CycleResult, tau_before: Pair) -> CycleResult:
-        """Return the cycle's result, continued from the drive's torque without commands."""
+        """Return the cycle's result, continued from the torque that the drive gave in the gap."""
         s = self.state
         estimate, carried = s.controller.estimate, tau_before
         if s.target is not None:
@@ -250,8 +250,8 @@ class DriveManager:
     def _in_fault(self, now_ns: int) -> DriveCommand:
         """Return the command to the drive of a module in FAULT.
 
-        A lost drive that may hold with its own loop gets no command. When the link comes back it
-        still holds, unless one of its axes lost torque meanwhile. Any other drive goes idle.
+        A lost drive that may hold with its own loop gets no command. Once the link is back it still
+        holds, unless one of its axes has lost torque. Any other drive is idled.
         """
         s = self.state
         lost = s.controller.cause == Cause.DRIVE_LOST
@@ -281,8 +281,8 @@ class DriveManager:
         A drive that holds with its own loop after its service died is taken over once its torques
         are known and a planner sends the gains on which the other five hold. Until then it gets no
         command: a knee taken over with stand gains, beside a knee on soft gains, rolled the torso,
-        and the robot tipped while the hand led. Without the onboard loop, an armed drive is not
-        this service's and reads as IDLE.
+        and the robot tipped while the hand led. Without the onboard loop, an armed drive belongs to
+        another controller and reads as IDLE.
         """
         s = self.state
         if not self.onboard:
@@ -295,9 +295,9 @@ class DriveManager:
         return reading
 
     def _is_to_be_taken_over(self, reading: DriveReading | None) -> bool:
-        """Return True if the drive may hold with its own loop, and so is taken over before a stop.
+        """Return True if the drive may hold with its own loop, so it is taken over before a stop.
 
-        An emergency stop starts from the drive's torque.
+        The emergency stop then starts from the drive's torque.
         """
         if not self.onboard or self.state.controller.failsafe.mode is not _DISARMED:
             return False
@@ -311,7 +311,7 @@ class DriveManager:
         return LastState.DAMP if mode is Mode.DAMP or s.estop else LastState.HELD
 
     def _inhibit(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
-        """Return what inhibits arming now, or None if that is not known yet."""
+        """Return the reason not to arm now, or None if it is not known yet."""
         s = self.state
         if reading is None or reading.status is DriveStatus.LOST:
             return None

@@ -1,9 +1,9 @@
 """Split of the local law between joint service and drive (docs/drives.md). Pure.
 
-Each motor's own loop holds a module's mean stiffness and damping about the references. The rest
-(difference of the two axes, feedforward, the limiter's reduction) is sent as torque, computed for
-each sample. So at every sample the drive gives exactly the torque of the service. Between samples,
-and after the service has died, the drive's own law
+Each motor's own loop applies the module's mean stiffness and damping about the references. The
+rest (difference of the two axes, feedforward, the limiter's reduction) is sent as torque, computed
+for each sample. So at every sample the drive gives exactly the torque of the service. Between
+samples, and after the service has died, the drive's own law
 
     torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel)
 
@@ -29,29 +29,31 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 
 GAIN_CHANGE: Final = 0.02
-"""Relative change of the gains below which the drive keeps its old ones: the difference is sent as
+"""Relative change of the gains below which the drive keeps its old gains. The difference is sent as
 torque, which saves traffic on the bus."""
 GAIN_UPDATE_MIN_MS: Final = 8
-"""Minimum time between two changes of the drive's gains, ms; the difference is sent as torque. In a
-blend the gains would change in every cycle, and three modules on one CAN bus were 15 to 20 ms
-behind by its end."""
+"""Minimum time between two changes of the drive's gains, ms; the difference is sent as torque.
+Without it, a blend changed the gains in every cycle, and by its end three modules on one CAN bus
+were 15 to 20 ms late."""
 POS_GAIN_MAX: Final = 400.0
 """Maximum position gain, 1/s: a stiffness with hardly any damping gets more damping."""
 INPUT_TORQUE_SHARE: Final = 0.75
-"""Fraction of current_lim's torque that may be sent as input_torque, which the firmware clamps on
-its own. A hip held with (900, 26) N m/rad has 463 on both motors. From 0.25 rad off its reference,
-the rest exceeds the clamp: its theta was 463 stiff instead of 26."""
+"""Fraction of current_lim's torque that may be sent as input_torque, which the firmware clamps
+separately. The excess is sent through the position. Without that, a hip held with (900, 26) N m/rad
+(463 on both motors) had a stiffness of 463 in theta instead of 26, beyond 0.25 rad from its
+reference."""
 
 HOLD_SHARE: Final = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
-"""Share of the way from a module's gains to HOLD's that its drive's own gains take, by kind.
+"""Fraction by which a drive's own gains rise from the module's towards HOLD's, by kind of module.
 
-An ankle's gains rise to all of HOLD's. On TRACK's own gains, with at most 4 N m s/rad on its phi
-and all six services dead, a push from the side decayed by 0.72 each half swing, and 7 of 26 pairs
-of pushes in step with it made the robot fall. A knee's gains rise a fifth of the way. Without that,
-a knee whose service froze was soft while the other leg's was stiff, and the robot fell (450 mm);
-with 600 N m/rad it moves by 23 mm. With all of HOLD's gains, the hand feels the drive's gains,
-which the service subtracts 2 ms late: 26 N in the squat instead of 18, and 19.8 N with 600 N m/rad.
-A module that HOLD stiffens only in phi keeps its gains, because half of a rise would act on theta.
+An ankle's gains rise fully. On TRACK's gains, with at most 4 N m s/rad on its phi and all six
+services dead, a push from the side decayed by 0.72 each half swing, and 7 of 26 pairs of pushes in
+step with the swing made the robot fall. A knee's gains rise by a fifth, to about 600 N m/rad.
+Without that, a knee whose service froze was soft while the other knee was stiff, and the robot
+moved by 450 mm and fell; with it, the robot moves by 23 mm. If a knee's gains rose fully, the hand
+would feel them, because the service subtracts them 2 ms late: 26 N in the squat, compared with 18 N
+without a rise and 19.8 N with a fifth. A module that HOLD stiffens only in phi keeps its gains,
+because half of a rise would act on theta.
 """
 
 
@@ -116,7 +118,7 @@ class DriveSetpointLaw:
         return MotorTarget(pos_ref, vel_ref, torque, (pos_gain, pos_gain), (vel_gain, vel_gain))
 
     def carried(self, target: MotorTarget, pos: Pair, vel: Pair) -> Pair:
-        """Return the joint torques, N m, of a drive at a sample after its last target.
+        """Return the joint torques, N m, that the drive's last target causes at a sample.
 
         Args:
             target: the last target that was sent.
@@ -146,12 +148,11 @@ class DriveFallback:
     """Law with which a drive continues when its joint service dies."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Read HOLD's gains."""
         self._hold_k_p, self._hold_k_d = config.hold_gains(module)
         self._share = HOLD_SHARE[kind_of(module)] if self._hold_k_p[1] > 0.0 else 0.0
 
     def law(self, setpoint: Setpoint, mode: Mode) -> Setpoint:
-        """Return the fallback for a setpoint; in DAMP, a drive without commands keeps sinking."""
+        """Return the fallback for a setpoint; unchanged in DAMP, so the drive keeps sinking."""
         if self._share == 0.0 or mode is Mode.DAMP:
             return setpoint
         return pd_law.raise_gains(setpoint, self._hold_k_p, self._hold_k_d, self._share)

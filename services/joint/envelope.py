@@ -1,23 +1,25 @@
 """Envelope of the commands that a joint service accepts from its planner. Pure.
 
-A planner may be wrong in any way: zero gains, a sign, a unit, a bit. Each module compares a command
-with the law's bounds over all poses (`GainSchedule.bounds`, made by `xrl gains`), with the joint's
-position, and with the previous command. A command outside is refused, counted and reported
-(`JointState.outside`). If a planner keeps sending such commands, its last good command becomes
-stale, and the module holds.
+A planner may be wrong in any way: zero gains, a wrong sign or unit, a flipped bit. Each module
+compares a command with the law's bounds over all poses (`GainSchedule.bounds`, made by
+`xrl gains`), with the joint's position, and with the previous command. A command outside the
+envelope is refused, counted and reported (`JointState.outside`). If a planner sends only such
+commands, its last good command becomes stale, and the module holds.
 
 The coupled torque corrects the pose of the whole body, so in each module it pulls the same way as
-the local spring. A coupled torque that drives the joint away from its reference is wrong, however
-small: ramped up together inside their bounds, those of knees and hips made the robot fall. It also
-does little work on a moving joint: 2 J under a push, and 6 J when a hand leads up by 0.45 m in a
-second, because it includes the eased lead. More work moves the robot along: ramped up in 0.3 s,
-knees and hips threw it off the floor.
+the local spring. A coupled torque that drives the joint away from its reference is wrong, even if
+it is within its bound: wrong torques of knees and hips, ramped up together within their bounds,
+made the robot fall.
+It also does little work on a moving joint: 2 J under a push, and 6 J when a hand leads up by 0.45 m
+in a second, because it includes the eased lead. More work moves the robot: torques of knees and
+hips that rose within 0.3 s threw it off the floor.
 
-A reference comes with its rate, so an ankle's reference moves as its rate says: to 0.3 mrad while a
-person leads, to 20 mrad while the height follows its own reference. A reference that deviates by
-more than `q_ref_astray` / `ASTRAY_S` is wrong: drifting by 0.3 rad/s, it tipped the robot over.
+A reference comes with its rate, and an ankle's reference follows its rate: within 0.3 mrad while a
+person leads, within 20 mrad while the height follows its own reference. A reference that drifts
+from its rate by more than `q_ref_astray` / `ASTRAY_S`, rad/s, is wrong: one that drifted by
+0.3 rad/s tipped the robot.
 
-A command with `hold` is accepted anyway. But a module that refused its numbers is not ready to
+A command with `hold` is accepted even outside the envelope. But the module is then not ready to
 track (`Failsafe.ready`), so no planner leads with such numbers.
 """
 
@@ -39,20 +41,20 @@ from shared.joints import kind_of
 ROUNDING = 0.02
 """Relative tolerance of the gain bounds: the schedule interpolates between rounded nodes."""
 GAP_TICKS = 4
-"""Ticks for which the allowed torque step grows with the time between commands. Without this limit,
-a wrong torque that is refused repeatedly would be accepted in the end."""
+"""Number of ticks for which the allowed torque step grows with the time between commands. Without
+this limit, a wrong torque that is refused repeatedly would finally be accepted."""
 UNSETTLED: Final = 0.5
-"""Share of a spring's torque that counts in HOLD, and until TRACK has blended in: a robot held off
-centre is still moving to the reference."""
+"""Share of a spring's torque that counts in HOLD, and until TRACK has blended in. A robot held off
+centre is then still away from the reference."""
 ASTRAY_S: Final = 0.5
-"""Time constant with which motion that the rate does not explain is forgotten, s."""
+"""Time constant with which motion that the rate does not explain decays, s."""
 ENERGY_S: Final = 0.3
-"""Time constant with which work of the coupled torque is forgotten, s."""
+"""Time constant with which the coupled torque's work decays, s."""
 _INSIDE: Final = Outside.NOTHING  # returned in each cycle: docs/contributing.md
 
 
 class Lately(msgspec.Struct, gc=False, frozen=True):
-    """Cumulative effect of the tracked commands, which no single command shows."""
+    """Cumulative effect of the tracked commands."""
 
     astray: Pair = pd_law.ZERO
     """Motion of the reference that its rate does not explain, rad."""
@@ -98,7 +100,7 @@ class Envelope:
         settled: bool = True,
         lately: Lately = NOTHING_YET,
     ) -> Outside:
-        """Return the first part of a command that lies outside.
+        """Return the first part of a command that is outside; NOTHING if it is inside.
 
         Written so that a NaN is outside: every comparison with it is false.
 
@@ -109,7 +111,7 @@ class Envelope:
             v: joint rates, rad/s.
             age_s: time by which the reference is extrapolated, s.
             settled: True if TRACK has blended in.
-            lately: result of `lately` for this command.
+            lately: result of `accumulated` for this command.
         """
         bounds, c = self._bounds, command
         if bounds is None:
@@ -194,7 +196,6 @@ def _astray(command: JointCommand, last: JointCommand, before: Pair) -> Pair:
 
 
 def _widened(gains: Bounds) -> Bounds:
-    """Return bounds of gains, widened by `ROUNDING`."""
     (phi_low, theta_low), (phi_high, theta_high) = gains
     return (
         ((1.0 - ROUNDING) * phi_low, (1.0 - ROUNDING) * theta_low),

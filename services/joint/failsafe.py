@@ -3,8 +3,8 @@
 Pure: state, now, inputs -> state. The transitions are one table; `tests/safety` sweeps every mode
 against every event.
 
-    DISARMED -> HOLD <-> TRACK;  any of them -> DAMP (e-stop);  any armed -> FAULT (drive or
-    its position lost), or DAMP, limp (the robot has fallen)
+    DISARMED -> HOLD <-> TRACK;  each of them -> DAMP (emergency stop)
+    HOLD, TRACK, DAMP -> FAULT (drive lost or disarmed, position lost), or DAMP, limp (after a fall)
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Q_REF_MAX: Final = 6.4
 TAU_RATE_MAX: Final = 1e3
 """Largest accepted rate of the feedforward torque, N m/s per N m of `Timing.tau_max`."""
 TRIPS: Final = (Event.SHAKING, Event.TORQUE_LIMIT, Event.TOO_FAST)
-"""Trips that a module detects on its own while it tracks (`services.joint.trips`)."""
+"""Trips that a module detects while it tracks (`services.joint.trips`)."""
 
 
 TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
@@ -82,9 +82,9 @@ TRANSITIONS: Final[dict[Mode, dict[Event, tuple[Mode, Cause]]]] = {
     },
     Mode.FAULT: {},
 }
-"""(mode, event) -> (next mode, cause); an event that is not listed changes nothing. Only a new
-service leaves DAMP and FAULT, and only if a person requested it (`services.joint.rearm_guard`): a
-robot under load never stiffens again on its own."""
+"""(mode, event) -> (next mode, cause); an event that is not listed changes nothing. A module in
+DAMP or FAULT holds again only with a new service that a person requested
+(`services.joint.rearm_guard`), so a robot under load never stiffens again on its own."""
 
 
 class Timing(msgspec.Struct, frozen=True):
@@ -95,7 +95,7 @@ class Timing(msgspec.Struct, frozen=True):
     engage_after_max_ns: int
     dropout_forget_ns: int
     dropouts_max: int
-    """Dropouts that double the wait up to its maximum; more would only take longer to forget."""
+    """Number of dropouts that double the wait up to its maximum; more are not counted."""
     k_p_max: float
     k_d_max: float
     v_max: float
@@ -121,14 +121,14 @@ def timing_of(config: RobotConfig) -> Timing:
 FALLEN_NS: Final = 50 * NS_PER_MS
 """Time for which a planner must report a fall, ns: one wrong command is not enough."""
 RETIRED_SESSIONS_KEPT: Final = 256
-"""Number of earlier sessions that stay refused; after more restarts, the oldest could return."""
+"""Number of earlier sessions that stay refused; after more restarts, the oldest is forgotten."""
 TAU_ACCEPTED_MAX: Final = 4.0
-"""Largest accepted feedforward and coupled torque, as a multiple of what a module's motors give:
-far from its reference the law may want more, and the limiter cuts it."""
+"""Largest accepted feedforward and coupled torque, as a multiple of a module's maximum torque: far
+from its reference the law may request more than the maximum, which the limiter cuts."""
 SEQ_AHEAD_MAX: Final = 500
-"""Largest step of `seq`: a wrong number, once accepted, would have all correct ones refused."""
+"""Largest accepted step of `seq`: after a far too high one, all correct ones would be refused."""
 TICKS_PER_S_MAX: Final = 2000
-"""Upper bound on a planner's ticks in a second, including those whose commands are lost."""
+"""Maximum rate of a planner's ticks, 1/s, including those whose commands are lost."""
 REFUSED_SHOWN_NS: Final = NS_PER_S
 """Time for which the cause of the newest refusal is reported, ns."""
 
@@ -151,7 +151,7 @@ class Failsafe(msgspec.Struct):
     retired: tuple[int, ...] = ()
     """Earlier sessions, the last `RETIRED_SESSIONS_KEPT`; their commands are refused."""
     fresh_since_ns: int = -1
-    """Start of the unbroken time with usable commands, ns; -1 without any."""
+    """Start of the present unbroken time with usable commands, ns; -1 without usable commands."""
     dropouts: Dropouts = msgspec.field(default_factory=Dropouts)
     """Recent dropouts of commands; each doubles the wait before TRACK."""
     refused: int = 0
@@ -162,15 +162,15 @@ class Failsafe(msgspec.Struct):
     refused_ns: int = 0
     """Time of the newest refusal."""
     outside: Outside = Outside.NOTHING
-    """Part of the newest usable command that lies outside the envelope."""
+    """Part of the newest usable command that is outside the envelope."""
     judged_ns: int = 0
-    """Time of that judgement; an old one is no longer reported."""
+    """Time of that judgement, which is reported only while recent."""
     planner_ended: bool = False
-    """True from the end of the followed planner's process until the cycle that acts on it."""
+    """True after the end of the followed planner's process, until the cycle that acts on it."""
     fallen_since_ns: int = -1
     """Time since which the planner has reported a fall, ns; -1 if it does not."""
     limp: bool = False
-    """In DAMP: the robot has fallen, and this module only damps."""
+    """True if the robot has fallen: in DAMP, this module then only damps."""
 
     def offer(
         self,
@@ -179,7 +179,7 @@ class Failsafe(msgspec.Struct):
         timing: Timing,
         outside: Outside = Outside.NOTHING,
     ) -> Refusal:
-        """Accept a command if it is usable; count it as refused if not.
+        """Accept a command if it is usable, or count it as refused; return the reason, or NONE.
 
         Args:
             command: the received command.
@@ -227,12 +227,12 @@ class Failsafe(msgspec.Struct):
         return now_ns - self.command.echo_t_ns if self.command is not None else -1
 
     def current_outside(self, now_ns: int, timing: Timing) -> Outside:
-        """Return the part of the newest command outside the envelope, while that is recent."""
+        """Return the part of the newest command outside the envelope; NOTHING if it is old."""
         old = now_ns - self.judged_ns > timing.max_command_age_ns
         return _INSIDE if old else self.outside
 
     def newest_refusal(self, now_ns: int) -> tuple[Refusal, int]:
-        """Return the cause of the newest refusal and its session, while that is recent."""
+        """Return the cause of the newest refusal and its session; NONE and 0 if it is old."""
         if not self.refused or now_ns - self.refused_ns > REFUSED_SHOWN_NS:
             return _USABLE, 0
         return self.refusal, self.refused_session
@@ -276,7 +276,7 @@ class Failsafe(msgspec.Struct):
         """
         mode, fresh = self.mode, self.is_fresh(now_ns, timing)
         tracks = mode is _TRACK
-        # its planner's process has ended, or a new session replaced one that went stale just now
+        # the planner's process has ended, or a new session has replaced a stale one in this cycle
         broken = tracks and self.fresh_since_ns < 0
         if not fresh or mode is _DISARMED:
             self.fresh_since_ns = -1  # commands from before arming do not count
@@ -328,7 +328,7 @@ class Failsafe(msgspec.Struct):
         age = now_ns - command.echo_t_ns
         if age < 0:
             return Refusal.FROM_THE_FUTURE
-        # another session takes over only once no command of the present one is usable
+        # another session takes over only once the present one has no usable command
         foreign = command.session != self.session
         if foreign and (command.session in self.retired or self.is_fresh(now_ns, timing)):
             return Refusal.FOREIGN_SESSION

@@ -1,7 +1,8 @@
 """Estimates the temperatures of motors and output stages, and the time left at their load. Pure.
 
-Each motor has two nodes and each output stage one, with the figures of [heat] in the robot file; Iq
-is a motor's current, from its torque:
+Each motor has two nodes (winding T_w, housing T_h) and each output stage one (T_s), with the
+figures of [heat] in the robot file. T_a is the air's temperature, and Iq a motor's current, from
+its torque:
 
     C_w T_w' = 1.5 R Iq^2 - (T_w - T_h) / R_wh        R = R_25 (1 + alpha (T_w - 25 C))
     C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha
@@ -26,30 +27,31 @@ from shared.config.robot_config import RobotConfig
 from shared.run_directory import live_dir, mapped
 
 STEP_S: Final = 0.5
-"""Step of the estimate, and of the seconds left."""
+"""Period of the estimate, s."""
 GAP_S: Final = 5.0
-"""Maximum time for which the last load is assumed to continue in a stopped process, s."""
+"""Maximum time for which the load is assumed to continue while the process is stopped, s."""
 LOAD_S: Final = 4.0
-"""Time constant of the mean load: a squat takes 5 s."""
+"""Time constant of the mean load, s; a squat takes 5 s."""
 UNKNOWN_S: Final = -1.0
-"""Value of the seconds left without an estimate."""
+"""Value of `left_s` without an estimate."""
 FOLLOW: Final = 0.5
-"""Share of a thermistor's deviation that corrects winding and housing alike, once a second. A
-housing error shifts its winding by 2 % of that in a second, so it is corrected within a minute."""
+"""Share of a thermistor's deviation that corrects both winding and housing, once a second. An error
+of the housing shifts its winding by 2 % of the error every second, so the readings correct it
+within a minute."""
 HOLDS_S: Final = 60.0
-"""Time for which a drive is assumed to hold after its service ended, s; a new one starts in 5 s."""
+"""Time for which a drive is assumed to hold after its service ended, s."""
 COOLS_S: Final = 4.0 * 3600.0
-"""Time after which a module is cold, s."""
+"""Time without load after which a module is cold, s."""
 COPPER: Final = 0.00393
 """Temperature coefficient of copper's resistance at 25 C, 1/K."""
 REFERENCE: Final = 25.0
 """Temperature at which the resistance is given, C."""
 _GRID_S: Final = tuple(LEFT_MAX_S * 1.35 ** (k - 29) for k in range(30))
-"""Times at which a winding's temperature is predicted, s: from 0.6 s on."""
+"""Times at which a winding's temperature is predicted, s; the first is 0.6 s."""
 
 
 class HeatState(msgspec.Struct):
-    """State of `HeatEstimate`, of axis0 and axis1, C."""
+    """State of `HeatEstimate`; pairs are of axis0 and axis1, temperatures in C."""
 
     winding: Pair = (0.0, 0.0)
     housing: Pair = (0.0, 0.0)
@@ -69,7 +71,7 @@ class HeatState(msgspec.Struct):
 
     @property
     def kept(self) -> tuple[float, ...]:
-        """Values that the next service starts from, C and (N m)^2."""
+        """Values from which the next service starts, C and (N m)^2."""
         return (*self.winding, *self.housing, *self.stage, *self.load)
 
 
@@ -95,7 +97,6 @@ class HeatEstimate:
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Read the figures of [heat]."""
         heat = config.heat
         self.enabled = heat.estimate
         per_torque2 = 1.0 / config.drive.torque_constant**2
@@ -149,9 +150,10 @@ class HeatEstimate:
             self._show(s)
 
     def resume(self, s: HeatState, kept: tuple[float, ...], passed_s: float) -> None:
-        """Start from the temperatures that an earlier service left, cooled since.
+        """Start from the temperatures of an earlier service, and let them cool.
 
-        The drive may have held the robot meanwhile, so the load continues for `HOLDS_S`.
+        The drive may have held the robot meanwhile, so the load is assumed to continue for
+        `HOLDS_S`.
 
         Args:
             s: the estimate, updated in place.
@@ -167,7 +169,7 @@ class HeatEstimate:
         s.load = (g, h)
 
     def skip(self, s: HeatState, seconds: float) -> None:
-        """Advance only the temperatures, under the present mean load; also for lockstep."""
+        """Advance only the temperatures, under the present mean load; lockstep uses this too."""
         while seconds > 0.0:
             self._step(s, s.load, min(STEP_S, seconds))
             seconds -= STEP_S
@@ -203,7 +205,7 @@ class HeatEstimate:
         return min(LEFT_MAX_S, left_s)
 
     def _winding_left_s(self, s: HeatState, i: int) -> float:
-        """Return the time until the winding reaches its limit, s: exact, on a grid of times.
+        """Return the time until the winding reaches its limit, s: exact at a grid of times.
 
         The system stays linear although the resistance rises with the temperature:
 
@@ -248,15 +250,15 @@ def report(s: HeatState, fet: Pair | None, motor: Pair | None) -> None:
 
 _KEPT: Final = struct.Struct("<q8d")
 _POSSIBLE: Final = (-60.0, 400.0)
-"""Range of valid values; a file with any other is ignored."""
+"""Range of valid values; a file with a value outside it is ignored."""
 
 
 class HeatFile:
     """A module's temperatures in its live directory, for a service that restarts.
 
-    The file is mapped: writing it is a store, which the control path may do. The supervisor copies
-    it to the disk (`tools.fleet.kept_state`). Times are on the monotonic clock, so after a restart
-    of the host no cooling is assumed.
+    The file is mapped, so writing it is only a store, which the control path may do. The supervisor
+    copies it to the disk (`tools.fleet.kept_state`). Times are on the monotonic clock, so after a
+    restart of the host no cooling is assumed.
     """
 
     def __init__(self, run_dir: Path, module: str) -> None:

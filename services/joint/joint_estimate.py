@@ -1,13 +1,14 @@
 """The joint's position and speed from a drive's samples, and which samples are accepted. Pure.
 
-A drive without a valid position keeps reporting numbers. Firmware 0.5.6 repeats the last value of a
-lost encoder until a heartbeat shows the error, and restarts its count, whole turns off, when it is
-back. A restarted drive reports 0: accepted for 40 ms, a knee at 0 was commanded -107 N m. So a
-sample that the joint cannot have reached is rejected. After a few of them, or when whole turns may
-be missing (`turn_watch`), the position counts as lost, even while the module is not controlled.
+A drive without a valid position still reports numbers. Firmware 0.5.6 repeats the last value of a
+lost encoder until a heartbeat shows the error. When the encoder is back, the count may be wrong by
+whole turns. A restarted drive reports 0: when this was accepted for 40 ms, a knee was commanded
+-107 N m. So a sample that the joint cannot have reached is rejected. After `REJECTED_MAX` rejected
+samples in a row, the position counts as lost. It also counts as lost when whole turns may be
+missing (`turn_watch`), even while the module is not controlled.
 
-A service that is held up reads two samples as one, or two within half a millisecond. If it counted
-its cycles, it would then send its states one cycle apart from the other modules
+A delayed service reads two samples as one, or two within half a millisecond. If it counted cycles,
+it would then send its states one cycle earlier or later than the other modules
 (`services.planner.state_phases`). So `SampleClock` counts elapsed periods.
 """
 
@@ -26,10 +27,10 @@ from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
 
 JUMP_TURNS: Final = 0.1
-"""Largest jump at the motor beyond the last velocity's, turns: 0.02 rad at the joint."""
+"""Largest jump of a motor beyond the motion at its last velocity, turns: 0.02 rad at the joint."""
 JUMP_SPEED: Final = 10.0
-"""Speed that a motor may have gained since the last sample, turn/s. That sample may be 100 ms old,
-and a leg in free fall gains 8."""
+"""Largest gain of a motor's speed since the last sample, turn/s. That sample may be 100 ms old; a
+leg in free fall gains 8 in that time."""
 SPEED_MAX: Final = 300.0
 """Largest speed, turn/s: 100 rad/s at a joint behind 18:1, as in
 `services.planner.watch.plausible`. A speed of 1e30 would also excuse any later jump."""
@@ -71,7 +72,7 @@ class JointEstimate(msgspec.Struct):
     accepted_ns: int = 0
     """Time of the newest accepted sample."""
     rejected_count: int = 0
-    """Samples rejected since then."""
+    """Number of samples rejected since then."""
     first: TurnWatch = msgspec.field(default_factory=TurnWatch)
     second: TurnWatch = msgspec.field(default_factory=TurnWatch)
     supply_v: float = 0.0
@@ -79,12 +80,12 @@ class JointEstimate(msgspec.Struct):
 
     @property
     def turns_lost(self) -> bool:
-        """True if the drive's count may lack turns, until its zero is cleared."""
+        """True if turns may be missing from the drive's count, until its zero is cleared."""
         return self.first.lost or self.second.lost
 
     @property
     def moved(self) -> bool:
-        """True if the drive has not yet shown why its position jumped while it was idle."""
+        """True while the cause of a jump of the idle drive's position is still unknown."""
         known = self.first.encoder_zero != UNKNOWN and self.second.encoder_zero != UNKNOWN
         return known and (self.first.moved or self.second.moved)
 
@@ -101,8 +102,8 @@ class JointEstimate(msgspec.Struct):
         Args:
             reading: the drive's sample.
             armed: True if the module is controlled; otherwise any position is accepted.
-            flushing: True if samples may be old and jump; no jump is rejected then.
-            tau: last torque of both joints, N m.
+            flushing: True if samples may be old and jump; no jump is then rejected.
+            tau: joint torque (phi, theta) of the last cycle, N m.
         """
         self.status, self.error, self.t_ns = reading.status, reading.error, reading.t_ns
         self.supply_v = reading.supply_v
@@ -157,7 +158,7 @@ class JointEstimate(msgspec.Struct):
 
 
 FOLLOW_SHIFT = 3
-"""The clock follows a sample's time by an eighth, so a single late sample still counts as one."""
+"""The clock moves an eighth of the way to a sample's time, so a late one counts as one period."""
 
 
 class SampleClock(msgspec.Struct):
@@ -171,7 +172,7 @@ class SampleClock(msgspec.Struct):
     count: int = 0
     before: int = 0
     at_ns: int = 0
-    """When the present period began, smoothed."""
+    """Smoothed start of the present period."""
 
     def advance(self, now_ns: int, period_ns: int) -> None:
         """Update the count with the time of a cycle and the drive's period."""
@@ -188,6 +189,6 @@ class SampleClock(msgspec.Struct):
     def passed(self, every: int, phase: int) -> bool:
         """Return True if a period phase, phase + every, ... began since the previous sample.
 
-        If a sample is lost, the next one passes the period.
+        If the sample of such a period is lost, the next sample returns True.
         """
         return (self.count - phase) // every > (self.before - phase) // every

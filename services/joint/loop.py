@@ -43,16 +43,16 @@ from shared.exceptions import DriveError
 from shared.process import StopFlag
 
 READ_TIMEOUT_S: Final = 0.005
-"""Longest wait for a sample; a cycle without one still runs the age rule and the failsafe."""
+"""Timeout of a wait for a sample, s (longer over USB); the failsafe also runs without a sample."""
 
 REPORT_EVERY_NS: Final = 10 * NS_PER_S
-"""Period at which the reason why a drive is not armed is logged again, ns."""
+"""Period at which the reason for not arming is logged again, ns."""
 START_NS: Final = 2 * NS_PER_S
-"""Time for which a drive may fail to acknowledge before that is an error, ns: it may start late."""
+"""Time for which missing acknowledgements are no error, ns: the drive may start late."""
 
 _WHY_NOT: Final = {
-    ArmingInhibit.UNZEROED: "the drive lost its power or its encoder since it was zeroed, or never "
-    "was zeroed; hang the robot from its hoist and run `xrl drive zero`",
+    ArmingInhibit.UNZEROED: "the drive was never zeroed, or has lost power or its encoder since; "
+    "hang the robot from its hoist and run `xrl drive zero`",
     ArmingInhibit.OUTSIDE_LIMITS: "the joint is at phi {q[0]:.3f}, theta {q[1]:.3f} rad, outside "
     "its limits; move it inside them, or correct the joint's zero",
     ArmingInhibit.LOST_TORQUE: "the drive held the robot and lost torque while no service ran: "
@@ -60,15 +60,16 @@ _WHY_NOT: Final = {
     ArmingInhibit.WAITING: "the drive holds with its own loop; the service takes it over once a "
     "planner runs",
     ArmingInhibit.FAILED: "drive error 0x{error:x}; the service clears it, and arms the drive if "
-    "it does not return",
+    "the error does not return",
     ArmingInhibit.UNACKNOWLEDGED: "no node acknowledges a frame on CAN bus {bus}; check the "
     "drive's power and its CAN cable, and run `xrl doctor`",
-    ArmingInhibit.REFUSED: f"{ARM_TRIES} requests to arm failed: drive error 0x{{error:x}}",
+    ArmingInhibit.REFUSED: f"{ARM_TRIES} attempts to arm failed: drive error 0x{{error:x}}; find "
+    "the cause, then run `xrl kill MODULE`",
 }
 
 
 class _OtherModules(Protocol):
-    """View that the joint services of a host have of each other, without a bus."""
+    """Shared view of the joint services of a host, without a bus."""
 
     def view(self, now_ns: int, /) -> NeighbourView:
         """Return this module's view of the others."""
@@ -94,7 +95,7 @@ class JointPorts(msgspec.Struct, frozen=True):
     traces: Outbox[JointTrace] | None
     """None if nothing is recorded for re-execution."""
     planner: _SessionEnds | None = None
-    """None if its end cannot be seen; its commands then become stale."""
+    """None if the end of its process cannot be detected; then its commands become stale."""
 
 
 class JointLoop:
@@ -115,13 +116,13 @@ class JointLoop:
 
         Args:
             config: the robot.
-            module: the decisions of a cycle.
+            module: makes the decisions of a cycle.
             drive: the module's drive.
             ports: publishers and subscribers.
             rearm_guard: shared memory for the next service of this module and for a local stop.
-            neighbours: this module's view of the other services on this host.
+            neighbours: shared memory with the other modules' services on this host.
             clock: replaces this host's monotonic clock, ns.
-            heat_file: temperatures from the previous service of this module, for the next.
+            heat_file: temperatures, from this module's previous service and for the next one.
         """
         self.module = module
         self._rearm_guard, self._neighbours = rearm_guard, neighbours
@@ -138,7 +139,7 @@ class JointLoop:
         self._nowhere = (-config.drive.zero_mark_turns,) * 2
 
     def run(self, stop: StopFlag) -> None:
-        """Run until a signal stops it.
+        """Run until a signal stops the service.
 
         On SIGTERM only this service ends: a drive that holds with its own loop keeps holding the
         robot, and the next service takes it over. On SIGINT the whole fleet stops, and the drive is
@@ -175,7 +176,7 @@ class JointLoop:
         step = module.step(now, reading, command, estop, near)
         controller, state = module.controller, module.state.controller
         due = controller.is_state_due(state)
-        if state.states == 0:  # a module that cannot publish its state must not arm
+        if state.states == 0:  # it arms only once a state is published
             self._has_sent, due = ports.states.put(controller.state(state, now)), False
         self._write(step)
         if self._neighbours is not None:
@@ -195,7 +196,7 @@ class JointLoop:
         return step
 
     def _is_stopped(self, now: int) -> bool:
-        """Return True if an emergency stop arrived or is set here, or the pendant is silent."""
+        """Return True if a stop was received or is set on this host, or the pendant is silent."""
         stop, guard = self._ports.estops.take(), self._rearm_guard
         if guard is None:
             return stop is not None
@@ -223,16 +224,17 @@ class JointLoop:
                 drive.set_position(self._nowhere)
 
     def report(self, step: DriveAction) -> None:
-        """Log faults and arming problems; the module does not track then, so logging is safe."""
+        """Log faults and reasons for not arming; the module does not track then, so it may log."""
         if step.event is None and step.inhibit is ArmingInhibit.NONE:
             return
         now, samples = self._clock(), self.module.state.controller.estimate
         if step.event is not None and step.event.cause == Cause.ESTOP and self._pendant.lost:
-            log.get("xrl").error("emergency stop: the pendant is silent")
+            log.get("xrl").error("emergency stop: the pendant fell silent")
         if step.event is not None and step.event.mode_after == Mode.FAULT:
             dead_bus = samples.status is DriveStatus.UNACKNOWLEDGED
             log.get("xrl").error(
-                "FAULT: %s, drive error 0x%x%s; restart this service to leave FAULT",
+                "FAULT: %s, drive error 0x%x%s; to leave FAULT, remove the cause, then run "
+                "`xrl kill MODULE`",
                 Cause(step.event.cause).name,
                 samples.error,
                 f", no node acknowledges a frame on CAN bus {self.module.bus}" if dead_bus else "",

@@ -1,18 +1,23 @@
 """Shared memory between the six joint services of one host, without a bus.
 
-After an emergency stop the knees sink. With ankles that only held, the COM moved back as the knees
-folded: from nearly straight legs (1.28 m) the robot fell over backwards. An ankle that knows its
-knee's angle keeps the hip joint where it was. With hips that only damped, the thighs dragged the
-torso back by 1.5 rad; with its COM 5 cm back and 10 cm up, the robot fell over. A hip that knows
-its ankle's and knee's angles holds the torso's attitude. A knee that sinks beside a knee whose
-service is dead tips the robot sideways: it fell within 4 s. Beside an ankle or a hip whose drive
-kept holding, it fell in 28 of 40 stops. So each knee must know whether all others go down with it.
-A limp module makes the others stiffen, in HOLD and in DAMP (`shared.robot.hold_rules`). Otherwise
-the robot fell within 1.3 s of a knee that went limp with the planner dead, and within 2 s of a stop
-beside a limp knee. A drive that loses power only falls silent. When the others stiffened only once
-it was lost, after 100 ms, the robot fell in 3 of 4 squats.
+After an emergency stop the knees sink, and each module must react to the others:
 
-This must work with planner and bus dead. So each service stores its row in each cycle in a file
+- If the ankles only held, the COM would move back as the knees fold: from nearly straight legs
+  (1.28 m) the robot fell over backwards. So an ankle uses its knee's angle to keep the hip joint in
+  place.
+- If the hips only damped, the thighs would drag the torso back by 1.5 rad; with its COM 5 cm back
+  and 10 cm up, the robot fell over. So a hip uses its ankle's and knee's angles to hold the torso's
+  attitude.
+- A knee that sinks beside a knee whose service is dead tips the robot sideways: it fell within 4 s.
+  Beside an ankle or hip whose drive kept holding, it fell in 28 of 40 stops. So a knee stops
+  sinking if another module does not go down.
+
+If a module is limp, others stiffen, in HOLD and in DAMP (`shared.robot.hold_rules`). Without that,
+the robot fell within 1.3 s after a knee went limp with the planner dead, and within 2 s after an
+emergency stop with a limp knee. A drive that loses power only falls silent. When the others
+stiffened only after 100 ms, at DRIVE_LOST, the robot fell in 3 of 4 squats.
+
+All this must work without planner and bus. So in each cycle each service stores its row in a file
 that all six have mapped, which the control path may do. Modules on another host are unknown: hips
 then damp, knees sink, and only a planner makes the others stiffen.
 """
@@ -35,19 +40,19 @@ from shared.run_directory import live_dir, mapped
 STALE_NS: Final = 20 * NS_PER_MS
 """Maximum age of a neighbour's angle, ns."""
 SILENT_NS: Final = 40 * NS_PER_MS
-"""Silence after which a drive may be limp, ns: shorter than the age limit, and much shorter than
-the time after which the drive counts as lost for good."""
+"""Silence after which a drive may be limp, ns: shorter than the age limit and the silence after
+which a drive is lost."""
 GONE_NS: Final = round(LOST_S * NS_PER_S)
-"""Age of a row beyond which its service is dead or its drive is lost, ns."""
+"""Age of a row above which its service is dead or its drive is lost, ns."""
 _LEG: Final = N_MODULES // 2
 """Offset from a module to the same module of the other leg."""
 _SUM: Final = struct.Struct("<Q")
 _BODY: Final = struct.Struct("<QddQQQ")
 _ROW: Final = struct.Struct("<QQddQQQ")
-"""Checksum of a `NeighbourRow`, then the row. A sequence lock would need other processors to see
-stores in order, which Arm does not guarantee."""
+"""Checksum of a `NeighbourRow`, then the row. A sequence lock would need stores to become visible
+in order, which Arm does not guarantee."""
 READS: Final = 5
-"""Maximum attempts to read a whole row; its writer may have died while writing."""
+"""Maximum number of attempts to read a whole row; its writer may have died while writing."""
 _SIZE: Final = N_MODULES * _ROW.size
 
 
@@ -63,21 +68,21 @@ class NeighbourRow(NamedTuple):
     mode: int
     """`Mode`."""
     caught: int = 0
-    """1 in DAMP if it no longer sinks: a caught knee, or a module that has stiffened."""
+    """1 in DAMP if it does not sink: a caught knee, or a module that has stiffened."""
     silent: int = 0
     """1 if its drive has been silent for `SILENT_NS`, and is not yet lost."""
 
 
 class NeighbourView(NamedTuple):
-    """View of a module's neighbours."""
+    """A module's view of its neighbours."""
 
     leg: Pair | None = None
-    """Theta and rate of its leg, rad, rad/s: for a hip, ankle and knee together; for an ankle, the
-    knee; None if unknown."""
+    """Theta and rate, rad, rad/s: for a hip the sum of its ankle's and knee's, for an ankle its
+    knee's; None if unknown."""
     sinks: bool = True
-    """For a knee: False if another module stays where it is; sinking on would tip the robot."""
+    """For a knee: False if another module stays up, because sinking would then tip the robot."""
     stiffen: bool = False
-    """True if another module is limp and this one must stiffen for it."""
+    """True if this module must stiffen because another one is limp."""
 
 
 UNKNOWN: Final = NeighbourView()
@@ -128,7 +133,7 @@ def _fresh(row: NeighbourRow | None, now_ns: int) -> NeighbourRow | None:
 
 
 def _is_elsewhere(row: NeighbourRow, now_ns: int) -> bool:
-    """Return True for a module on another host, or on another host's clock."""
+    """Return True for a module on another host, or with another host's clock."""
     return row.t_ns == 0 or row.t_ns > now_ns + STALE_NS
 
 

@@ -1,7 +1,7 @@
 """The local law of one module: diagonal PD plus feedforward (docs/law.md#references-and-age).
 
-A `Setpoint` is the law at one instant. A blend of two setpoints is again one PD law, with blended
-gains, so a drive's own loop can hold the law at every moment of a hand-over. Pure.
+A `Setpoint` is the law at one instant. A blend of two setpoints is again a PD law, with blended
+gains, so a drive's own loop can apply it at any moment of a change of mode. Pure.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Setpoint(msgspec.Struct, gc=False, frozen=True):
 def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
     """Return tau = k_p (q_ref - q) + k_d (v_ref - v) + tau_ff + tau_coupled, N m.
 
-    This is docs/law.md (13). For a command it is the torque at the time when the planner sent it.
+    This is docs/law.md (13). For a command it is the torque at age zero.
     """
     s = setpoint
     return (
@@ -49,7 +49,7 @@ def torque(setpoint: Setpoint | JointCommand, q: Pair, v: Pair) -> Pair:
 
 
 def extrapolate(command: JointCommand, age_s: float) -> Setpoint:
-    """Return the command's law at an age, references extrapolated by their rates: docs/law.md (21).
+    """Return the command's law at an age, extrapolated by its rates: docs/law.md (21).
 
     Args:
         command: references and rates at age zero.
@@ -72,7 +72,7 @@ def stand(q: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
 
 
 def take_over(q: Pair, v: Pair, tau: Pair, k_p: Pair, k_d: Pair) -> Setpoint:
-    """Return the law for standing at q that gives tau at rate v; once frozen, v_ref fades."""
+    """Return the law for standing at q that gives tau at rate v; v_ref fades once it is frozen."""
     return Setpoint(q, v, tau, ZERO, k_p, k_d)
 
 
@@ -81,8 +81,8 @@ def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
 
     Args:
         setpoint: the setpoint when the references froze.
-        moving_share: fraction of v_ref and tau_coupled that is left, 1 .. 0. v_ref fades too: in
-            mid-squat k_d v_ref is 10 N m, which would be a jolt if dropped at once.
+        moving_share: remaining fraction of v_ref and tau_coupled, 1 .. 0. v_ref fades too, because
+            in mid-squat k_d v_ref is 10 N m, and dropping it at once would be a jolt.
     """
     s, share = setpoint, moving_share
     if share <= 0.0:
@@ -93,9 +93,9 @@ def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
 
 
 def raise_gains(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoint:
-    """Return a setpoint whose gains have risen by `share` (0 .. 1) to at least k_p and k_d.
+    """Return a setpoint with lower gains raised towards k_p and k_d by `share` of the gap.
 
-    Gains only rise: a larger D can only add to the stiffness that holds the robot up.
+    `share` is 0 .. 1. Gains never fall, because a larger D only adds stiffness.
     """
     s = setpoint
     return Setpoint(
@@ -117,13 +117,13 @@ def raise_gains(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpo
 def limit_stiffening(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -> Setpoint:
     """Return a setpoint for which stiffening adds at most `added_max` to a spring's torque.
 
-    An axis that is too far from its reference holds its position instead: its spring's torque
-    becomes feedforward, so the torque does not change.
+    An axis too far from its reference holds its position instead. Its spring's torque becomes
+    feedforward, so the torque does not change.
 
     Args:
         setpoint: the present setpoint.
         q: joint angles, rad.
-        k_p: gains to which it will rise, N m/rad.
+        k_p: gains to which the setpoint will rise, N m/rad.
         added_max: maximum torque that stiffening may add to a spring, N m.
     """
     s = setpoint
@@ -142,8 +142,8 @@ def limit_stiffening(setpoint: Setpoint, q: Pair, k_p: Pair, added_max: float) -
 def load_to_feedforward(setpoint: Setpoint, sinks: tuple[bool, bool], q: Pair) -> Setpoint:
     """Return a setpoint in which the sinking axes carry their load as feedforward.
 
-    DAMP removes their springs but not the load. A robot that stands without a planner has no other
-    feedforward that could fade.
+    DAMP removes the springs of these axes, but not the load. A robot that stands without a planner
+    has no other feedforward that could fade.
 
     Args:
         setpoint: the present setpoint.
@@ -171,7 +171,7 @@ def damp(
         setpoint: from `load_to_feedforward`, with rates and coupling faded.
         sinks: for (phi, theta), True if the axis sinks.
         k_d: damping of an axis that sinks, N m s/rad.
-        feedforward_share: fraction of its feedforward that is left, 1 .. 0.
+        feedforward_share: remaining fraction of such an axis's feedforward, 1 .. 0.
         risen: progress of its damping to k_d, 0 .. 1.
     """
     s, share = setpoint, feedforward_share
@@ -190,7 +190,7 @@ def damp(
 
 
 def hold_theta(setpoint: Setpoint, q_ref: float, v_ref: float, k_p: float, k_d: float) -> Setpoint:
-    """Return DAMP's law with theta held: rad, rad/s, N m/rad, N m s/rad."""
+    """Return DAMP's law with theta held at q_ref; rad, rad/s, N m/rad, N m s/rad."""
     s = setpoint
     return Setpoint(
         (s.q_ref[0], q_ref),
@@ -203,7 +203,7 @@ def hold_theta(setpoint: Setpoint, q_ref: float, v_ref: float, k_p: float, k_d: 
 
 
 def blend(a: Setpoint, b: Setpoint, share: float) -> Setpoint:
-    """Return the PD law whose torque is (1 - share) a + share b at every q and v."""
+    """Return the PD law with (1 - share) of a's torque plus share of b's, at every q and v."""
     k_p = _mix(a.k_p, b.k_p, share)
     k_d = _mix(a.k_d, b.k_d, share)
     return Setpoint(

@@ -1,24 +1,24 @@
-"""Shared memory in which a joint service keeps four values in a few bytes, without a bus.
+"""Shared memory with four values for each joint service, independent of the bus.
 
 The first is the service's last state, for its successor. A module that lost torque is never
-re-armed automatically (`shared.robot.fault_table`). But the supervisor restarts a service that
-crashed, and meanwhile its drive may have disarmed or an emergency stop may be active. Without the
-last state, the new service would arm and stiffen the module unasked. A person's command
-for the module (`xrl kill`, `xrl start`, `xrl up`) clears it.
+re-armed automatically (`shared.robot.fault_table`). But the supervisor restarts a crashed service,
+whose drive may have disarmed, or whose emergency stop may be active. Without the last state, the
+new service would arm and stiffen the module unasked. A person's command for the module (`xrl kill`,
+`xrl start`, `xrl up`) clears all four values.
 
 The second is an emergency stop from the robot's own host (`xrl estop`). It works with the planner
 dead and every link of the bus cut, and stays active until a person restarts the module.
 
-The third is the pendant's count of beats (see below). The fourth is who engaged the active
-emergency stop, on whatever path, for `xrl status`.
+The third is the pendant's count of beats. The fourth is the source of the active emergency stop,
+for `xrl status`.
 
 The file is mapped: reading and writing it are loads and stores, which the control path may do.
 
 The pendant is a dead man's handle: all six modules stop when it falls silent. Any failure between
-the person's hand and the robot (cable, radio or host) shows as silence. The pendant beats in each
-module's shared memory, without a bus. A pendant that was never there, or was laid down properly, is
-not missed. Silence is counted in the module's cycles, so a pause of the whole machine does not
-count.
+the person's hand and the robot (cable, radio or host) causes silence. The pendant writes its beats
+to each module's shared memory, without a bus. No silence is counted before the first beat, or after
+the pendant has been laid down properly. Silence is counted in the module's cycles, so a pause of
+the whole machine does not count.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from shared.run_directory import live_dir, mapped
 _LAST_STATE, _STOP = range(2)
 _BEATS: Final = struct.Struct("<Q")
 _BEATS_AT: Final = 8
-"""Aligned, so that a store of it is atomic."""
+"""Aligned, so that a store to it is atomic."""
 _SOURCE_AT: Final = _BEATS_AT + _BEATS.size
 SOURCE_MAX: Final = 80
 """Maximum length of a stop's source, bytes."""
@@ -52,11 +52,11 @@ class LastState(IntEnum):
     """Last state of the service before this one."""
 
     NOTHING = 0
-    """There was no service, it ended in order, or a person has requested the module."""
+    """There was no service, it ended normally, or a person has requested the module."""
     HELD = 1
-    """It held the robot: a drive that is no longer armed has lost torque."""
+    """It held the robot, so if the drive is not armed, the drive has lost torque."""
     DAMP = 2
-    """It sank after an emergency stop, and so must the next service."""
+    """It was in DAMP or an emergency stop was active, so the next service starts in DAMP."""
 
 
 def path_of(run_dir: Path, module: str) -> Path:
@@ -65,7 +65,7 @@ def path_of(run_dir: Path, module: str) -> Path:
 
 
 class RearmGuard:
-    """A module's rearm guard, a file in its run directory that processes map."""
+    """A module's rearm guard: a file in the live directory that several processes map."""
 
     def __init__(self, run_dir: Path, module: str) -> None:
         """Open the file, or create it; the directory must exist.
@@ -82,21 +82,18 @@ class RearmGuard:
         return LastState(value) if value in tuple(LastState) else LastState.HELD
 
     def write(self, last_state: LastState) -> None:
-        """Write the last state if it has changed.
-
-        A running service without a change therefore does not undo `clear`.
-        """
+        """Write the last state if it has changed, so a running service does not undo `clear`."""
         if last_state is not self._written:
             self._memory[_LAST_STATE] = self._written = last_state
 
     def note_stop(self, source: str) -> None:
-        """Store who engaged the emergency stop; the first name stays."""
+        """Store the source of the emergency stop, unless one is stored already."""
         if self._memory[_SOURCE_AT] == 0 and source:
             kept = _kept(source)
             self._memory[_SOURCE_AT : _SOURCE_AT + len(kept)] = kept
 
     def stop_on(self, number: signal.Signals) -> None:
-        """Engage the emergency stop on a signal: the memory outlives its file and the disk."""
+        """Engage the emergency stop on a signal, which works even if the memory's file is gone."""
 
         def engage(_number: int, _frame: FrameType | None) -> None:
             self._memory[_STOP] = 1
@@ -106,7 +103,7 @@ class RearmGuard:
 
     @property
     def stop_requested(self) -> bool:
-        """True if someone on this host has set the emergency stop."""
+        """True if the emergency stop was set on this host."""
         return self._memory[_STOP] != 0
 
     @property
@@ -116,10 +113,10 @@ class RearmGuard:
 
 
 def clear(run_dir: Path, *modules: str) -> None:
-    """Clear the state of the modules' earlier services, because a person requests the modules.
+    """Clear the stored values of modules, because a person restarts or re-arms them.
 
-    The files are cleared in place, because a running service has them mapped. If a file cannot be
-    opened, none is cleared.
+    The files are cleared in place, because a running service has them mapped. If an existing file
+    cannot be opened, none is cleared.
     """
     with ExitStack() as stack:
         files = []
@@ -131,7 +128,7 @@ def clear(run_dir: Path, *modules: str) -> None:
 
 
 def stop_source(run_dir: Path, module: str) -> str:
-    """Return who engaged a module's emergency stop; empty if unknown or not engaged."""
+    """Return the source of a module's emergency stop; empty if it is unknown or not engaged."""
     try:
         with path_of(run_dir, module).open("rb") as file:
             file.seek(_SOURCE_AT)
@@ -145,12 +142,14 @@ def _kept(source: str) -> bytes:
 
 
 def request_stop(run_dir: Path, module: str, source: str = "") -> bool:
-    """Stop a module, with or without a bus; return False if it has no service on this host.
+    """Request a module's emergency stop, even without a bus.
+
+    Returns False if the module has no service on this host.
 
     Args:
         run_dir: the fleet's run directory.
         module: name of the module.
-        source: who requests the stop.
+        source: name of the person or process that requests the stop.
 
     Raises:
         OSError: the file exists but cannot be written.
@@ -173,16 +172,16 @@ class Pendant:
     """Sending side of the pendant, for the modules whose services are on this host."""
 
     def __init__(self, run_dir: Path, modules: Sequence[str]) -> None:
-        """Open the modules' files; a module without a file has no service here.
+        """Open the modules' files; a module without a file has no service on this host.
 
         Raises:
-            OSError: a file is there and cannot be written.
+            OSError: a file exists but cannot be written.
         """
         self._memories = {}
         self._beats = 0
         for module in modules:
             with suppress(FileNotFoundError), path_of(run_dir, module).open("r+b") as file:
-                file.truncate(len(_NEW))  # a service that starts now has not sized it yet
+                file.truncate(len(_NEW))  # a starting service may not have sized it yet
                 self._memories[module] = mmap.mmap(file.fileno(), len(_NEW))
 
     @property
@@ -192,7 +191,7 @@ class Pendant:
 
     @property
     def beats(self) -> tuple[int, ...]:
-        """Beats as the modules read them, of this pendant or of another."""
+        """Beats that the modules read, of this pendant or of another."""
         return tuple(_BEATS.unpack_from(row, _BEATS_AT)[0] for row in self._memories.values())
 
     def beat(self) -> None:
@@ -206,7 +205,7 @@ class Pendant:
 
     def _write_beats(self, beats: int) -> None:
         for memory in self._memories.values():
-            # packing in place writes zeros first, which a reader takes for no pendant
+            # packing in place would write zeros first, which mean that there is no pendant
             memory[_BEATS_AT : _BEATS_AT + _BEATS.size] = _BEATS.pack(beats)
 
 

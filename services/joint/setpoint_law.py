@@ -1,9 +1,8 @@
 """The setpoint of each instant: TRACK follows the planner, HOLD freezes, DAMP sinks. Pure.
 
-After a fall, a module in DAMP only damps; docs/hazards.md has the figures behind this choice.
+After a fall, a module in DAMP only damps; docs/hazards.md has the figures for this.
 
-A change of mode freezes the present setpoint. The new mode starts from it, so no change makes a
-torque step.
+A change of mode freezes the present setpoint. The new mode starts from it, without a torque step.
 """
 
 from __future__ import annotations
@@ -27,18 +26,18 @@ class SetpointState(msgspec.Struct, kw_only=True):
     """State of `SetpointLaw`."""
 
     frozen: Setpoint
-    """The setpoint at the last change of mode: HOLD keeps it, TRACK blends from it."""
+    """Setpoint at the last change of mode: HOLD keeps it, TRACK blends from it."""
     current: Setpoint
-    """The setpoint of the last cycle."""
+    """Setpoint of the last cycle."""
     changed_ns: int = 0
     """Time of the last change of mode."""
     stiffened_ns: int = 0
-    """Time at which it began to stiffen because another module may be limp; 0 if it has not."""
+    """Time at which the module began to stiffen because another may be limp, ns; 0 before."""
     sinking: SinkingState
 
     @property
     def stays(self) -> bool:
-        """True in DAMP for a module that no longer sinks: caught, or stiffened for a limp one."""
+        """True in DAMP if the module does not sink: it is caught, or stiffened for a limp one."""
         return self.sinking.caught or self.sinking.held is not None
 
 
@@ -46,7 +45,6 @@ class SetpointLaw:
     """Chooses and blends a module's setpoints."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Read the module's gains and times."""
         service, stand = config.joint_service, config.stand_gains(module)
         self.stand_k_p, self.stand_k_d = stand.k_p, stand.k_d
         self._support_k_p, self._support_k_d = config.support_gains(module)
@@ -78,7 +76,7 @@ class SetpointLaw:
         s.frozen = s.current = setpoint
 
     def change(self, s: SetpointState, mode: Mode, now_ns: int, q: Pair) -> None:
-        """Freeze the setpoint in force for a new mode.
+        """Freeze the present setpoint for a new mode.
 
         Args:
             s: the setpoints, updated in place.
@@ -148,9 +146,9 @@ class SetpointLaw:
         return pd_law.blend(self._held(s, since_ns), fresh, since_ns / self._blend_ns)
 
     def _bound_stiffening(self, s: SetpointState, now_ns: int, q: Pair) -> None:
-        """Bound the torque that HOLD's springs add as they rise to their support gains.
+        """Limit the torque that HOLD's springs add as they rise to their support gains.
 
-        A hip with a soft theta may be far from its reference because a hand has turned the torso.
+        A hip with a soft theta may be far from its reference, because a hand has turned the torso.
         """
         held = self._held(s, now_ns - s.changed_ns)
         near = pd_law.limit_stiffening(held, q, self._support_k_p, self._hold_torque)
@@ -158,7 +156,7 @@ class SetpointLaw:
             s.frozen, s.changed_ns = near, now_ns
 
     def _held(self, s: SetpointState, since_ns: int) -> Setpoint:
-        """Return HOLD's setpoint: frozen, while some gains rise to the stand gains."""
+        """Return HOLD's setpoint: the frozen one, with some gains rising to the stand gains."""
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._stiffen_ns)
         frozen = pd_law.freeze(s.frozen, moving)

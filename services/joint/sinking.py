@@ -2,18 +2,17 @@
 
 Every phi holds. The theta axes of `damp_sinks` lose their stiffness and carry their load as
 feedforward that fades, so they sink slowly and never drop. A knee is caught at its stop, or at its
-present angle if another module does not go down with it. An ankle holds. As its knee folds, its
-reference turns so that the hip joint, and with it the COM, stays as far ahead of the ankle as it
-was:
+present angle if another module does not go down. An ankle holds. As its knee folds, its reference
+turns so that the hip joint, and with it the COM, stays as far ahead of the ankle as before:
 
     ahead = l2 sin(ankle) + l1 sin(ankle + knee)
 
 A hip that knows the angles of ankle and knee holds the torso's attitude. A hip that does not know
 them damps, and the torso turns with the thighs (`services.joint.neighbours`).
 
-A module that must stiffen for a limp one stops sinking: it holds its position with its support
-gains (`RobotConfig.support_gains`) and keeps its load as feedforward, also that of a stop's spring.
-A leg with a limp knee stands as a strut only on a stiff hip.
+A module that must stiffen for a limp module stops sinking. It holds its position with its support
+gains (`RobotConfig.support_gains`), and keeps its load as feedforward, even that of a stop's
+spring. A leg with a limp knee stands as a strut only on a stiff hip.
 """
 
 from __future__ import annotations
@@ -33,14 +32,14 @@ from shared.config.robot_config import RobotConfig
 from shared.joints import kind_of
 
 DOUBT_NS: Final = 100 * NS_PER_MS
-"""Time for which a reason to hold must last, ns: a stop does not reach all six in the same cycle,
-and services pause."""
+"""Time for which a reason to hold must last, ns: a stop does not reach all six modules in the same
+cycle, and services may pause."""
 LOW_M: Final = 0.1
-"""Height of a hip joint above its ankle, m; below it the robot is on the floor."""
+"""Height of a hip joint above its ankle below which the robot is on the floor, m."""
 LEAST_M: Final = 1e-6
 """Minimum length of a leg, m; a leg folded onto itself has no direction."""
 LEVEL_MAX: Final = 0.1
-"""Maximum attitude error that is corrected, rad; a larger error is not corrected harder."""
+"""Maximum attitude error that the spring corrects, rad; larger errors count as this."""
 
 
 class SinkingState(msgspec.Struct):
@@ -49,20 +48,20 @@ class SinkingState(msgspec.Struct):
     stop: float | None = None
     """Angle at which a knee is caught, rad; None without a stop."""
     upright: float | None = None
-    """Torso's attitude at the start, as the sum of the leg's thetas, rad; None if unknown."""
+    """Sum of the leg's thetas at the start, which is the torso's attitude, rad; None if unknown."""
     held: Setpoint | None = None
-    """Setpoint from which it stiffens for a limp module, at the angles of that moment, with its
-    load as feedforward; None if it does not stiffen."""
+    """Setpoint from which the module stiffens because another is limp, with its angles and load at
+    that time; None if it does not stiffen."""
     below: float | None = None
     """Last known angle of `NeighbourView.leg`, rad; None before the first."""
     caught: bool = False
-    """True if a knee no longer sinks because another module does not."""
+    """True if a knee has stopped sinking because another module does not sink."""
     doubt_ns: int = -1
-    """Time after the start since which there is a reason to hold, ns; -1 without one."""
+    """Time after the start at which the present reason to hold began, ns; -1 without a reason."""
     held_ns: int = -1
     """Time after the start at which `held` was set, ns; -1 before."""
     ahead: float | None = None
-    """Distance that the hip joint must stay ahead of its ankle, m; None if unknown."""
+    """Distance by which the hip joint must stay ahead of its ankle, m; None if unknown."""
     start: float = 0.0
     """The ankle's theta when that distance was measured, rad."""
 
@@ -71,7 +70,6 @@ class Sinking:
     """Sinking law of one module."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Read times and gains."""
         service, kind = config.joint_service, kind_of(module)
         stand = config.stand_gains(module)
         self._k_p, self._k_d = stand.k_p, stand.k_d
@@ -109,12 +107,12 @@ class Sinking:
         q: Pair,
         near: NeighbourView,
     ) -> Setpoint:
-        """Return the local law.
+        """Return the setpoint of this instant.
 
         Args:
             s: state of the sinking, updated in place.
             frozen_setpoint: the setpoint that `begin` returned.
-            current: the setpoint in force until now.
+            current: the setpoint of the last cycle.
             since_ns: time since `begin`, ns.
             q: joint angles, rad.
             near: view of the other modules.
@@ -140,13 +138,13 @@ class Sinking:
     def _sunk(self, frozen_setpoint: Setpoint, since_ns: int) -> Setpoint:
         """Return the law of sinking."""
         share = max(0.0, 1.0 - since_ns / self._fade_ns)
-        risen = min(1.0, since_ns / self._blend_ns)  # without the ramp a step of 33 N m
+        risen = min(1.0, since_ns / self._blend_ns)  # without the ramp there is a step of 33 N m
         held = pd_law.freeze(frozen_setpoint, max(0.0, 1.0 - since_ns / self._coupled_ramp_ns))
         held = pd_law.raise_gains(held, self._k_p, self._k_d, 1.0 - share)
         return pd_law.damp(held, self._sinks, self._damp_k_d, share, risen)
 
     def _carried(self, current: Setpoint, q: Pair) -> Setpoint:
-        """Return a setpoint of the same torque that holds the sinking axes where they are."""
+        """Return a setpoint of the same torque that holds the sinking axes at their position."""
         carried = pd_law.load_to_feedforward(current, self._sinks, q)
         theta = q[1] if self._sinks[1] else carried.q_ref[1]
         return msgspec.structs.replace(carried, q_ref=(carried.q_ref[0], theta))
@@ -161,7 +159,7 @@ class Sinking:
     def _levelled(
         self, s: SinkingState, sunk: Setpoint, theta: float, near: NeighbourView, risen: float
     ) -> Setpoint:
-        """Return the law of a hip; without new angles of its leg, the last ones apply."""
+        """Return the law of a hip; without new angles of its leg, it uses the last ones."""
         rate = 0.0
         if near.leg is not None:
             s.below, rate = near.leg
@@ -176,7 +174,7 @@ class Sinking:
     def _placed(
         self, s: SinkingState, sunk: Setpoint, theta: float, near: NeighbourView
     ) -> Setpoint:
-        """Return the law of an ankle; without a new angle of its knee, the last one applies."""
+        """Return the law of an ankle; without a new angle of its knee, it uses the last one."""
         rate = 0.0
         if near.leg is not None:
             knee, rate = near.leg
@@ -193,7 +191,7 @@ class Sinking:
         place = math.asin(s.ahead / length) - math.atan2(across, along)
         low, high = self._limits
         place = clamp(place, min(low, s.start), max(high, s.start))
-        wanted = sunk.q_ref[1] + place - s.start  # its spring keeps carrying its load
+        wanted = sunk.q_ref[1] + place - s.start  # the spring keeps its load
         up = self._thigh * math.cos(place + s.below)
         height = self._shank * math.cos(place) + up
         v_ref = -rate * up / height if height > LOW_M else 0.0

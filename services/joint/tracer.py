@@ -1,7 +1,7 @@
 """Records each cycle's inputs and decisions, so that it can be re-executed. Pure.
 
-Nothing else records the order in which a service took its inputs: in the log's order, 22 to 97 % of
-the ticks came out wrong (docs/logs.md).
+Nothing else records the order in which a service received its inputs: with inputs in the log's
+order, 22 to 97 % of the ticks were wrong (docs/logs.md).
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from shared.bus.messages import JointCommand, Pair
 from shared.bus.traces import CycleTrace, JointTrace
 
 CYCLES: Final = 10
-"""Cycles in a message; a killed service loses the unsent ones."""
+"""Number of cycles in a message; the unsent cycles of a killed service are lost."""
 SNAPSHOT_EVERY: Final = 50
-"""Messages from one snapshot of the service to the next: 1 s."""
+"""Number of messages between two snapshots of the service: 1 s."""
 
 _NOTHING: Final = (0.0, 0.0)
 _UNTOLD: Final = (-1.0, -1.0)
@@ -28,15 +28,14 @@ _UNTOLD: Final = (-1.0, -1.0)
 _Cycle = tuple[
     int, DriveReading | None, JointCommand | None, bool, DriveAction, NeighbourView, int, int, Pair
 ]
-"""A cycle's raw inputs and outcome. Ten at a time are turned into a message, which is cheaper than
-converting in each cold cycle."""
+"""A cycle's raw inputs and outcome. Converting ten at once is cheaper than converting one in each
+cold cycle."""
 
 
 class Tracer:
     """Collects the cycles of one module's service."""
 
     def __init__(self, module: DriveManager) -> None:
-        """Start before the first cycle."""
         self._module = module
         self._encode = msgspec.json.Encoder().encode
         self._cycles: list[_Cycle] = []
@@ -55,7 +54,7 @@ class Tracer:
         malformed: int = 0,
         ended: int = 0,
     ) -> JointTrace | None:
-        """Record a cycle; return a message when it is full."""
+        """Record a cycle; return a message once it has `CYCLES`."""
         tau = self._module.state.controller.tau
         self._cycles.append((now_ns, reading, command, estop, step, near, malformed, ended, tau))
         return self.take() if len(self._cycles) == CYCLES else None
@@ -76,7 +75,7 @@ class Tracer:
         return trace
 
     def _remember(self) -> None:
-        """Take the snapshot if the next message carries it."""
+        """Take a snapshot if the next message carries one."""
         due = self._seq % SNAPSHOT_EVERY == 0
         self._snapshot = self._encode(self._module.state).decode() if due else ""
 

@@ -1,16 +1,17 @@
-"""Trips that a joint service detects on its own; it then holds, whatever its planner sends. Pure.
+"""Trips that a joint service detects; it then holds, whatever its planner sends. Pure.
 
-With gains that do not suit its drivetrain, the robot shakes within 0.1 s of being led, and only the
-six services see that, at 500 Hz. Each service watches its own torque and speed while it tracks
+With gains that do not suit its drivetrain, the robot shakes within 0.1 s of being led. Only the six
+services can detect that, at 500 Hz. Each service monitors its torque and speed while it tracks
 (`shared.robot.trip_table`; limits: [trips] of the robot file):
 
     shaking   RMS of the torque above `SHAKE_ABOVE_HZ`, over `SHAKE_S`
     torque    a motor that stays at the limit of the torque diamond
-    speed     a joint that turns faster than it is ever led
+    speed     a joint that turns faster than the planner ever leads it
 
-The law's own torques end at about 4 Hz (`GainSchedule.coupling_bandwidth_hz`). Led, pushed with
-75 % of what soles and motors bear, and on plants with every error drawn, shaking reached 4 N m. On
-the drivetrains on which the unfiltered law falls it is 55 to 77 N m, and 15 N m after 20 to 60 ms.
+The law's own torques stay below about 4 Hz (`GainSchedule.coupling_bandwidth_hz`). Shaking reached
+4 N m on simulated plants with every error drawn at random, while they were led and pushed with 75 %
+of the push that soles and motors bear. On drivetrains on which the robot falls if the coupled
+torque has no low-pass, it reaches 15 N m after 20 to 60 ms, and then 55 to 77 N m.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from shared.config.robot_config import RobotConfig
 from shared.robot import trip_table
 
 SHAKE_ABOVE_HZ: Final = 8.0
-"""Above the law's bandwidth, and above the coupled torque's low-pass and a hand."""
+"""Frequency above which torque counts as shaking, Hz: above the bandwidths of law and hand."""
 SHAKE_S: Final = 0.1
-"""Time constant of the mean square."""
+"""Time constant of the torque's mean square, s."""
 AT_LIMIT: Final = 0.995
-"""Share of the torque diamond at which a motor counts as at its limit."""
+"""Share of the torque diamond at which a motor counts as being at its limit."""
 _NONE: Final = Event.NONE  # returned in each cycle: docs/contributing.md
 
 
@@ -79,7 +80,7 @@ class JointTrips(msgspec.Struct):
     """Time since which the joint turns too fast, ns; 0 if it does not."""
 
     def reset(self, tau: Pair) -> None:
-        """Restart from the drive's torque, N m: nothing trips before TRACK."""
+        """Restart from the drive's torque, N m, because only a module in TRACK trips."""
         self.slow, self.mean = tau, (0.0, 0.0)
         self.at_limit_ns = self.fast_ns = 0
 

@@ -1,17 +1,18 @@
 """Detects that an encoder may have missed whole turns of its motor. Pure.
 
 The drive adds up differences of the encoder's angle within the turn, each the short way round. If
-no words arrive, for up to 51 ms without an error, the count stays where it was. After more than
-half a turn, the count continues the wrong way, and the joint is 0.18 rad off in phi and in theta.
-The angle within the turn cannot show that, because the count is off by whole turns. The motion can:
-an axis that stands exactly still right after it was fast has received no words. How far it may have
-moved since is bounded by its earlier speed and `ACCELERATION`.
+the encoder's words are missing, which is no error for up to 51 ms, the count does not change. If
+the motor turns by more than half a turn meanwhile, the count is then wrong by whole turns; each
+turn is 0.18 rad in phi and in theta. The angle within the turn cannot show that. The motion can: an
+axis that stands exactly still right after fast motion has received no words. Its earlier speed and
+`ACCELERATION` bound its motion since.
 
 An encoder without power reads 0, which passes the parity check. The count then rests where the
-angle within the turn is 0, and no error is ever reported. A live motor may rest there too: of 960
-drawn crouches of 10 s, in six one of the twelve did. While the drive is armed, turns therefore
-count as lost only if the estimate also jumped there, or if the motor's torque changes by more than
-stiction and the estimate does not. Before that, a motor that rests there does not arm.
+angle within the turn is 0, and no error is ever reported. A live motor may rest there too: in 6 of
+960 random crouches of 10 s, one of the twelve motors did. So while the drive is armed, turns count
+as lost only if the estimate also jumped there, or if the motor's torque changes by more than
+stiction but the estimate does not. While the drive is not armed, a rest there is enough, and the
+drive stays unarmed.
 """
 
 from __future__ import annotations
@@ -23,29 +24,30 @@ import msgspec
 from shared.clock import NS_PER_MS, NS_PER_S
 
 ACCELERATION: Final = 400.0
-"""Maximum of a motor while the robot stands or one leg is limp, turn/s^2 (measured: 144)."""
+"""Largest acceleration of a standing robot's motors, limp leg or not, turn/s^2 (measured: 144)."""
 FADES: Final = 200.0
-"""Rate at which the bounds of the speed close in on it, turn/s^2."""
+"""Rate at which the bounds of the speed approach the estimated speed, turn/s^2."""
 STILL: Final = 2e-5
-"""Largest change at rest, turns: a third of a count of 16384; estimates settle to it."""
+"""Largest change at rest, turns: a third of a count of 16384; estimates settle to within it."""
 STILL_NS: Final = 4 * NS_PER_MS
-"""Time without a change after which an estimate does not follow an encoder, ns."""
+"""Time without a change after which an estimate has stopped following its encoder, ns."""
 SAMPLE_NS: Final = 4 * NS_PER_MS
-"""Maximum time between samples, ns; after a longer one the link failed, and the drive counts on."""
+"""Maximum time between samples, ns. If it is longer, the link failed and the drive still counts."""
 SETTLES_S: Final = 0.008
 """Maximum time from the last word until the estimate rests, s."""
 GAP_NS: Final = 53 * NS_PER_MS
-"""Maximum gap, ns: the drive reports a longer one after 51 ms, so a longer rest is real."""
+"""Maximum gap in the words, ns: the drive reports a gap after 51 ms, so a longer rest is real."""
 AT_ZERO: Final = 2e-4
-"""Tolerance, turns: three counts of 16384; single precision at the mark of 64 resolves 8e-6."""
+"""Tolerance of `is_zero`, turns: three counts of 16384; float32 at the mark of 64 resolves 8e-6."""
 JUMPED: Final = 1.0
-"""Speed of the estimate shortly before the rest, turn/s, that shows a jump: of 0.003 turns or more,
-at the estimator's bandwidth of 1000 rad/s. A smaller jump turns a joint by 0.5 mrad at most."""
+"""Speed of the estimate, shortly before its rest, that shows a jump, turn/s: at the estimator's
+bandwidth of 1000 rad/s, a jump of 0.003 turns or more. A smaller one is below 0.5 mrad at the
+joint."""
 PEAK_FADES: Final = 10.0
-"""Rate at which that speed is forgotten, turn/s^2."""
+"""Decay of that speed, turn/s^2."""
 STICTION: Final = 5.0
-"""Change of tau_theta + tau_phi (or minus, for the second motor), N m, that moves a live motor by
-more than `STILL`, through its friction and the drivetrain's flex."""
+"""Change of tau_theta + tau_phi (second motor: tau_theta - tau_phi), N m, that moves a live motor
+by more than `STILL`, through its friction and the drivetrain's flex."""
 UNKNOWN: Final = -1.0
 """Value of `encoder_zero` before the drive has answered."""
 
@@ -63,26 +65,26 @@ class TurnWatch(msgspec.Struct):
     peak: float = 0.0
     """Highest recent speed when the estimate last changed."""
     torque: float = 0.0
-    """Torque of the motor then, as for `STICTION`."""
+    """Torque of the motor at that time, as for `STICTION`."""
     encoder_zero: float = UNKNOWN
     """Position at which the encoder's angle within the turn is 0, modulo a turn."""
     moved: bool = False
-    """True after an impossible jump while the module was not controlled: by a new zero, or by
-    missing turns. Setting the count moves `encoder_zero`; a missing turn does not."""
+    """True after an impossible jump while the module was not controlled, because of a new zero or
+    missing turns. A new zero changes `encoder_zero`; a missing turn does not."""
     lost: bool = False
     """True if turns may be missing, until the drive's zero is cleared."""
 
     def process(
         self, t_ns: int, pos: float, vel: float, jump: float, free: float, torque: float | None
     ) -> bool:
-        """Process a sample; return True if the motor can have reached it.
+        """Process a sample; return True if the motor may have reached it.
 
         Args:
             t_ns: time of the sample.
             pos: turns.
             vel: turn/s.
             jump: change since the last accepted sample, turns.
-            free: largest possible jump while the encoder is read all the time, turns.
+            free: largest possible jump if the encoder was read without gaps, turns.
             torque: of the motor, as for `STICTION`, N m; None while the drive is not armed.
         """
         dt_s = (t_ns - self.newest_ns) / NS_PER_S
@@ -126,7 +128,7 @@ class TurnWatch(msgspec.Struct):
         return self.encoder_zero != UNKNOWN and (off < AT_ZERO or off > 1.0 - AT_ZERO)
 
     def compare(self, encoder_zero: float) -> None:
-        """Update the position at which the encoder reads 0, as the drive reports it, turns."""
+        """Update the reported position at which the encoder reads 0, turns."""
         if self.moved and self.is_zero(encoder_zero):
             self.lost = True
         self.encoder_zero, self.moved = encoder_zero, False

@@ -30,7 +30,7 @@ _UNIX = "unixsock-stream/"
 def main() -> int:
     """Run until SIGTERM or SIGINT; return the exit code."""
     parser = process.service_parser(__doc__ or "", "python -m services.network_proxy")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the losses and delays (0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of losses and delays (0)")
     arguments = parser.parse_args()
     logger = log.setup("network_proxy")
     config = load(arguments.config)
@@ -53,10 +53,10 @@ def main() -> int:
         finally:
             control.close()
             relay.close()
-            impairments.clear("all", now_ns())  # so that the log has the counts of each
+            impairments.clear("all", now_ns())  # so that the log has every impairment's counts
             watch.close()
     logger.info(
-        "stopped: %d connections refused, %d stuck connections closed",
+        "stopped: connections refused: %d, stuck connections closed: %d",
         relay.refused,
         relay.stuck,
     )
@@ -64,7 +64,6 @@ def main() -> int:
 
 
 def _proxy_endpoint(pair: Pair, config: RobotConfig, run_dir: Path) -> ProxyEndpoint:
-    """Create the endpoint between two processes; BusError if that is not possible."""
     path = Path(expand(endpoint_through(pair), run_dir).removeprefix(_UNIX))
     beyond = address_of(expand(config.bus.endpoints[pair.listens], run_dir))
     return ProxyEndpoint(pair, SocketListener(path), beyond)

@@ -1,10 +1,10 @@
 """One connection of a pair: its two ends, and the batches on their way in each direction.
 
-Zenoh's wire format (zenoh-protocol, wire version 9): on a stream, each batch is a length of two
-bytes, little endian, then that many bytes. A batch holds frames. A frame holds a header, a sequence
-number, extensions and network messages. Messages of the application are PUSH. All else (opening a
-link, declaring subscriptions, keep-alive) is the link's own traffic. A datagram network would
-retransmit it and a stream does not, so it may be late but never lost.
+Zenoh's wire format (zenoh-protocol, wire version 9): on a stream, each batch starts with its
+length, two bytes, little endian. A batch contains frames. A frame contains a header, a sequence
+number, extensions and network messages. Application messages are PUSH. All others (opening a link,
+declaring subscriptions, keep-alive) are the link's own traffic. The proxy may delay this traffic
+but never drops it, because nothing retransmits it on a stream.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ from services.network_proxy.sockets import READ, WRITE, Ready, SocketWatch
 from shared.config.impairment import HELD, Direction, Impairer
 
 PENDING_MAX: Final = 262_144
-"""Maximum due bytes that wait for a slow receiver. Above it the sender is no longer read, as on a
-direct link.
+"""Maximum due bytes that wait for a slow receiver. Above it, the proxy stops reading the sender,
+which then blocks as on a direct link.
 """
 WAITING_MAX: Final = 4_194_304
-"""Maximum bytes that are not due yet, before the sender is no longer read: 10 s of states."""
+"""Maximum bytes that are not due yet, 10 s of states. Above it, the proxy stops reading the sender.
+"""
 _READ: Final = 65_536
 _LENGTH: Final = struct.Struct("<H")
 _ID: Final = 0x1F  # low five bits of every header
-_EXTENDED: Final = 0x80  # of a header: extensions follow
+_EXTENDED: Final = 0x80  # header bit: extensions follow
 _FRAME: Final = 0x05
 _PUSH: Final = 0x1D
-_ENCODING: Final = 0x60  # of an extension: unit, number or bytes
+_ENCODING: Final = 0x60  # extension bits: unit, number or bytes
 _NUMBER: Final = 0x20
 _BYTES: Final = 0x40
 
 
 class Splitter:
-    """Cuts a stream into batches."""
+    """Splits a stream into batches."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return every batch that is complete now, each with its length before it."""
+        """Return the batches that `data` completes, each with its length prefix."""
         data = self._rest + data
         begin, batches = 0, []
         while begin + 2 <= len(data):
@@ -57,9 +58,9 @@ class Splitter:
 
 
 def carries_messages(batch: bytes) -> bool:
-    """Return True for a batch of the application's messages, which a network may lose.
+    """Return True for a batch of application messages, which may be lost.
 
-    A batch that cannot be parsed is not one: it may be late, but is never lost.
+    Returns False for a batch that cannot be parsed, which is therefore never lost.
     """
     try:
         if batch[2] & _ID != _FRAME:
@@ -73,7 +74,7 @@ def carries_messages(batch: bytes) -> bool:
 
 
 def _number(batch: bytes, at: int) -> tuple[int, int]:
-    """Return a number with seven bits per byte, least significant first, and where it ends."""
+    """Decode seven bits per byte, least significant first; return the number and the next index."""
     value, shift = 0, 0
     while True:
         byte = batch[at]
@@ -96,22 +97,22 @@ def _after_extensions(batch: bytes, at: int) -> int:
 
 
 class Waiting(NamedTuple):
-    """A batch on its way."""
+    """A batch that waits to be forwarded."""
 
     release_ns: int
     batch: bytes
-    """Empty for the end, which the other side sees as late as all else."""
+    """Empty for the end of the stream, which is delayed like a batch."""
     counted: Impairer | None = None
-    """Impairer that counted it as passed; None without one, or for the second of a pair."""
+    """Impairer that counted the batch as passed; None without one, or for a duplicate."""
 
     def count_lost(self) -> None:
-        """Count the batch as lost instead of passed, because its connection is gone."""
+        """Count the batch as lost instead of passed, because its connection is closed."""
         if self.counted is not None:
             self.counted.drop()
 
 
 class Flow:
-    """Reads batches from one end, and writes each to the other when it is due; neither blocks."""
+    """Reads batches from one end, and writes each to the other end when due, without blocking."""
 
     def __init__(self, source: socket.socket, sink: socket.socket, direction: Direction) -> None:
         self.source, self.sink, self.direction = source, sink, direction
@@ -139,12 +140,12 @@ class Flow:
 
     @property
     def reads(self) -> bool:
-        """True while the source must be read: not while too much waits for the sink."""
+        """True while the source is open and not too much waits for the sink."""
         return not self.ended and len(self._pending) < PENDING_MAX and self._waits < WAITING_MAX
 
     @property
     def over(self) -> bool:
-        """True once the sink has received all, and the end is due."""
+        """True once the end of the stream is due and everything before it is written."""
         return self._closing and not self._pending
 
     def read(self, now_ns: int) -> list[Waiting]:
@@ -168,7 +169,7 @@ class Flow:
         return found + self._keep(rows)
 
     def release(self, now_ns: int) -> list[Waiting]:
-        """Return batches that an ended partition held back, due like new batches."""
+        """Return the batches held back by a partition that has ended, delayed like new ones."""
         impairer = self.direction.active
         if not self._held or (impairer is not None and impairer.what.partition):
             return []
@@ -176,7 +177,7 @@ class Flow:
         return [self._resumed(row, now_ns) for row in found]
 
     def put(self, row: Waiting) -> None:
-        """Write a due batch, and keep the part that the sink does not take."""
+        """Write a due batch, and queue the part that the sink does not accept."""
         self._waits -= len(row.batch)
         if self.broken:
             row.count_lost()
@@ -188,7 +189,7 @@ class Flow:
             self._send(row)
 
     def flush(self) -> None:
-        """Write as much as the sink takes."""
+        """Write as much of the queue as the sink accepts."""
         try:
             sent = self.sink.send(self._pending)
         except BlockingIOError:
@@ -203,10 +204,10 @@ class Flow:
             self._unsent.popleft()
 
     def stuck_ns(self, now_ns: int) -> int:
-        """Return for how long the sink has accepted none of the waiting bytes.
+        """Return the time for which the sink has accepted none of the waiting bytes.
 
-        Each call tries to write: a UNIX socket does not count as ready before most of it is read.
-        The time is measured from one call to the next.
+        Each call tries to write, because a UNIX socket is not reported as writable before most of
+        its buffer is read. The time counts from the first call that finds bytes waiting.
         """
         if self._pending:
             self.flush()
@@ -217,7 +218,7 @@ class Flow:
         return 0 if self._since_ns is None else now_ns - self._since_ns
 
     def drop(self) -> None:
-        """Count held and unwritten messages as lost: the connection is gone."""
+        """Count held and unsent messages as lost, because the connection is closed."""
         self._break()
         for row in self._held:
             row.count_lost()
@@ -247,7 +248,7 @@ class Flow:
             self._queue(row, row.batch[sent:])
 
     def _keep(self, rows: list[Waiting]) -> list[Waiting]:
-        """Hold back the messages of a partition; return the rest."""
+        """Store the batches that a partition holds back; return the others."""
         found: list[Waiting] = []
         for row in rows:
             self._waits += len(row.batch)
@@ -255,19 +256,19 @@ class Flow:
         return found
 
     def _message(self, now_ns: int, batch: bytes) -> list[Waiting]:
-        """Return a message once per release; only the first one counts."""
+        """Return a row for each copy of a message; only the first copy is counted."""
         impairer = self.direction.active
         times = sorted(self._not_before(t) for t in self.direction.passes(now_ns, len(batch)))
         return [Waiting(t, batch, None if n else impairer) for n, t in enumerate(times)]
 
     def _resumed(self, row: Waiting, now_ns: int) -> Waiting:
         release_ns = self._later(now_ns)
-        if row.counted is not None:  # a held message: it is on a stream
+        if row.counted is not None:  # a held message, which is always on a stream
             self._stream_ns = release_ns
         return row._replace(release_ns=release_ns)
 
     def _later(self, now_ns: int) -> int:
-        """Return the release time of a batch that must not be lost, in order with the others."""
+        """Return the release time of a batch that must be neither lost nor reordered."""
         impairer = self.direction.active
         release_ns = now_ns if impairer is None else impairer.delays(now_ns)
         if release_ns != HELD:
@@ -277,9 +278,9 @@ class Flow:
         return release_ns
 
     def _not_before(self, release_ns: int) -> int:
-        """Return a message's release time, never before an earlier message on the same stream.
+        """Return a message's release time, not before that of an earlier message on the stream.
 
-        This holds after an impairment has ended too: messages that it delayed still come first.
+        This also applies after an impairment ends: the messages that it delayed come first.
         """
         if release_ns == HELD:
             return HELD
@@ -291,10 +292,11 @@ class Flow:
 
 
 class Connection:
-    """Both flows of a connection, and whether they have ended.
+    """Both flows of a connection.
 
-    `ends` are the sockets of the dialling side and of the other, `directions` the impairments there
-    and back. `taken` is called with what a flow has read, and the time, ns.
+    `ends` are the sockets of the dialling and of the listening process. `directions` are the
+    impairments from the first to the second and back. `taken` is called with the batches that a
+    flow has read, and the time, ns.
     """
 
     def __init__(
@@ -308,7 +310,7 @@ class Connection:
         there, back = Flow(first, second, directions[0]), Flow(second, first, directions[1])
         self.flows = (there, back)
         self.parted = False
-        """True once it is closed; what waits for it is dropped."""
+        """True once the connection is closed; its waiting batches are dropped."""
         self._watch, self._taken = watch, taken
         self._ready: tuple[Ready, Ready] = (
             partial(self._is_ready, there, back),
@@ -319,14 +321,14 @@ class Connection:
 
     @property
     def left(self) -> bool:
-        """True if a process has left it, even if the other has not seen that yet."""
+        """True if a process has closed its end, even if the other has not seen that yet."""
         return any(flow.ended for flow in self.flows)
 
     @property
     def over(self) -> bool:
-        """True once an end has received everything, or both have left: none receives the rest.
+        """True once an end has received everything, or both processes have closed their ends.
 
-        Zenoh closes both directions at once: an end that no longer sends does not receive either.
+        Zenoh closes both directions at once, so an end that has stopped sending receives nothing.
         """
         there, back = self.flows
         return there.over or back.over or (there.ended and back.ended)
@@ -345,7 +347,7 @@ class Connection:
             self._watch.want(flow.source, events, ready)
 
     def part(self) -> None:
-        """Close both ends; held messages are lost."""
+        """Close both ends; held and unsent messages are lost."""
         self.parted = True
         for flow, ready in zip(self.flows, self._ready, strict=True):
             self._watch.want(flow.source, 0, ready)
@@ -353,9 +355,9 @@ class Connection:
             flow.drop()
 
     def _is_ready(self, source: Flow, sink: Flow, events: int, now_ns: int) -> None:
-        """Handle a ready end: one flow reads there, the other writes."""
+        """Handle a ready end, from which one flow reads and to which the other writes."""
         if self.parted:
-            return  # it was parted earlier in this turn
+            return  # it was closed earlier in this cycle
         if events & WRITE:
             sink.flush()
         self._taken(self, source, source.read(now_ns) if events & READ else [], now_ns)

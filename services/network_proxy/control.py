@@ -1,4 +1,4 @@
-"""Control of the network proxy: reads requests, executes them, replies. Never blocks."""
+"""Control of the network proxy: reads requests, executes them and replies, without blocking."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ from shared.network.proxy_protocol import (
 from shared.toml_file import check_ranges
 
 ASKED_MAX: Final = 64
-"""Maximum number of impairments: each costs time with every message, and a line in every reply."""
+"""Maximum number of impairments; each costs time per message, and adds a row to every reply."""
 WAIT_MAX_S: Final = 86_400.0
 """Maximum delay until an impairment starts, s."""
 
 
 class CommandHandler:
-    """Executes requests, or replies why not."""
+    """Executes requests, or replies with the reason for a refusal."""
 
     def __init__(self, impairments: ImpairmentSchedule) -> None:
         self._injections = impairments
         self.changed = False
-        """True after an impairment has started or ended; the loop clears it."""
+        """True after a request, which may have started or ended an impairment; the loop clears
+        it."""
 
     def obey(self, request: Request) -> Reply:
-        """Execute a request and reply with the impairments."""
+        """Execute a request; reply with the active and planned impairments, or with an error."""
         at_ns = now_ns()
         try:
             if isinstance(request, Begin):
@@ -55,7 +56,7 @@ class CommandHandler:
         return Reply(requested=tuple(self._asked(at_ns)))
 
     def _problem(self, request: Begin) -> str:
-        """Return why it is refused, empty if it is not; ConfigError for a number out of range."""
+        """Return a reason to refuse, or ""; raise ConfigError for a number out of range."""
         check_ranges("inject", request.inject)
         if not 0.0 <= request.in_s <= WAIT_MAX_S:
             return f"starts in {request.in_s:g} s; must be between 0 and {WAIT_MAX_S:g} s"
@@ -124,7 +125,7 @@ class _Asker:
             sent = self.end.send(self.answer)
         except BlockingIOError:
             return
-        except OSError:  # it left before its reply
+        except OSError:  # the client left before its reply
             self.gone = True
             self.half.clear()
             self.answer.clear()
@@ -133,10 +134,10 @@ class _Asker:
 
 
 class ControlSocket:
-    """A UNIX socket that reads one request per line."""
+    """UNIX socket that receives requests and sends replies, one per line."""
 
     def __init__(self, path: Path, obey: Callable[[Request], Reply], watch: SocketWatch) -> None:
-        """Listen; BusError if the socket cannot be created."""
+        """Listen on a path; raise BusError if the socket cannot be created."""
         self._obey, self._watch = obey, watch
         self._askers: list[_Asker] = []
         self._listener = SocketListener(path)
@@ -161,7 +162,7 @@ class ControlSocket:
     def _is_ready(self, asker: _Asker, events: int, _now_ns: int) -> None:
         """Serve one client: the reply first, then the next request."""
         if asker not in self._askers:
-            return  # it left earlier in this turn
+            return  # it was dropped earlier in this cycle
         if events & WRITE:
             asker.write()
         if events & READ:

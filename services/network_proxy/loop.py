@@ -1,4 +1,4 @@
-"""The loop: forward due batches, execute commands, start and end impairments."""
+"""Loop of the proxy: forwards due batches, executes commands, starts and ends impairments."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from shared.network.impairment_schedule import ImpairmentSchedule
 from shared.process import StopFlag
 
 LOOK_S: Final = 0.02
-"""Maximum wait before the stop flag is checked, s. The last events must still reach the recorder,
-which records for 0.1 s after its own stop.
+"""Maximum wait before the stop flag is checked, s. It is short, so that the last events reach the
+recorder, which records for 0.1 s after its own stop.
 """
 
 

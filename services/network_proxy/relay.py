@@ -13,12 +13,13 @@ from services.network_proxy.sockets import READ, ProxyEndpoint, SocketWatch
 from shared.config.impairment import Direction
 
 LINKS_MAX: Final = 16
-"""Maximum connections of one pair. In a partition, a live process redials about every second, and a
-frozen one closes none. Beyond the maximum, the oldest abandoned connection is closed."""
+"""Maximum number of connections per pair. In a partition, a live process redials about every
+second, and a stopped process closes no connection. At the maximum, a new connection replaces the
+oldest one that a process has closed, or else the oldest one."""
 
 
 class _Due(NamedTuple):
-    """A batch that waits for its release; of two for the same time, the earlier one goes first."""
+    """A batch that waits for its release; batches for the same time go in order of arrival."""
 
     release_ns: int
     number: int
@@ -28,7 +29,7 @@ class _Due(NamedTuple):
 
 
 class Relay:
-    """Every connection, and every batch that is not due yet."""
+    """Keeps all connections, and the batches that are not due yet."""
 
     def __init__(
         self,
@@ -39,8 +40,8 @@ class Relay:
     ) -> None:
         """Start listening.
 
-        `directions` are the impairments by name; other directions forward at once. After
-        `lease_ns`, Zenoh gives up a silent link.
+        `directions` are the directions that can be impaired, by name; all others forward at once.
+        Zenoh gives up a link that is silent for `lease_ns`.
         """
         self._directions, self._watch, self._lease_ns = directions, watch, lease_ns
         self._links: dict[ProxyEndpoint, list[Connection]] = {
@@ -50,7 +51,7 @@ class Relay:
         self._looks_ns = 0
         self._count = count()
         self.stuck = 0
-        """Connections that were closed because an end no longer accepted anything."""
+        """Number of connections closed because an end no longer accepted data."""
         for endpoint in endpoints:
             watch.want(endpoint.listener.socket, READ, partial(self._dialled, endpoint))
 
@@ -61,32 +62,32 @@ class Relay:
 
     @property
     def refused(self) -> int:
-        """Connections to a missing process, or without a free descriptor."""
+        """Number of connections refused: the other process or a free descriptor was missing."""
         return sum(endpoint.missing + endpoint.listener.turned_away for endpoint in self._links)
 
     def next_ns(self) -> int | None:
-        """Return when the next batch is due, or None if none waits."""
+        """Return the time at which the next batch is due, ns; None if no batch waits."""
         return self._due[0].release_ns if self._due else None
 
     def release_due(self, now_ns: int) -> None:
-        """Release every batch whose time has come."""
+        """Forward every batch that is due."""
         while self._due and self._due[0].release_ns <= now_ns:
             due = heapq.heappop(self._due)
             due.flow.put(due.row)
             self._settle(due.connection)
 
     def release_held(self, now_ns: int) -> None:
-        """Forward what ended partitions have held back."""
+        """Forward the batches held back by partitions that have ended."""
         for links in list(self._links.values()):
             for connection in list(links):
                 for flow in connection.flows:
                     self._pass_on(connection, flow, flow.release(now_ns), now_ns)
 
     def part_stuck(self, now_ns: int) -> None:
-        """Close stuck connections: an end that has accepted nothing for a lease has left its link.
+        """Close every connection with an end that has accepted no data for `lease_ns`.
 
-        Zenoh may have given up the link at both ends without closing it: each end waits for room to
-        say so, and no longer reads. While all this waits here, nothing else would ever end it.
+        Both processes may have given up the link without closing it: each waits for buffer space to
+        announce this, and no longer reads. Nothing else would resolve this deadlock.
         """
         if now_ns < self._looks_ns:
             return
@@ -122,7 +123,7 @@ class Relay:
     def _pass_on(
         self, connection: Connection, flow: Flow, rows: list[Waiting], now_ns: int
     ) -> None:
-        """Release what is due, and keep the rest."""
+        """Forward the batches that are due, and queue the others."""
         for row in rows:
             if row.release_ns <= now_ns:
                 flow.put(row)
@@ -132,14 +133,13 @@ class Relay:
         self._settle(connection)
 
     def _settle(self, connection: Connection) -> None:
-        """Close a connection if it is over; otherwise keep watching it."""
         if connection.over:
             self._part(connection)
         elif not connection.parted:
             connection.watch_ends()
 
     def _part(self, connection: Connection) -> None:
-        """Close a connection; what waits for it is lost."""
+        """Close a connection; its waiting batches are lost."""
         if connection.parted:
             return
         connection.part()

@@ -25,7 +25,7 @@ Ready: TypeAlias = Callable[[int, int], None]
 
 
 class SocketWatch:
-    """Watch on every socket of the loop; their number and descriptors are not limited."""
+    """Watch on the loop's sockets, without the descriptor limit of `select`."""
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
@@ -47,10 +47,10 @@ class SocketWatch:
             self._selector.register(end, events, ready)
 
     def wait(self, patience_s: float) -> list[tuple[Ready, int]]:
-        """Wait until a socket is ready; return callbacks and readiness, none after `patience_s`.
+        """Wait until a socket is ready, at most `patience_s`; return callbacks and readiness.
 
-        The selector itself would round the time up to a whole millisecond, longer than some
-        requested delays. So `select` waits for the selector's epoll, as one socket.
+        The selector would round the time up to a whole millisecond, longer than some requested
+        delays. So `select` waits for the selector's epoll descriptor.
         """
         if not select.select([self._selector], [], [], patience_s)[0]:
             return []
@@ -63,15 +63,15 @@ class SocketWatch:
 
 
 class SocketListener:
-    """Listens on a UNIX socket and accepts without waiting, even without a free descriptor.
+    """Listens on a UNIX socket and accepts without blocking, even without a free descriptor.
 
-    The file of a killed process is removed.
+    It replaces the socket file that a killed process left behind.
     """
 
     def __init__(self, path: Path) -> None:
-        """Listen on a path; BusError if the socket cannot be created."""
+        """Listen on a path; raise BusError if the socket cannot be created."""
         self.turned_away = 0
-        """Connections that were refused for lack of a descriptor."""
+        """Number of connections refused for lack of a descriptor."""
         self._path = path
         self.socket = socket.socket(socket.AF_UNIX)
         try:
@@ -81,14 +81,14 @@ class SocketListener:
             self.socket.listen()
         except OSError as error:
             self.socket.close()
-            text = f"{path}: {error.strerror or error}; choose another endpoint"
+            text = f"{path}: {error.strerror or error}; choose another --run-dir"
             raise BusError(text) from None
         self.socket.setblocking(False)
         self._spare: int | None = None
         self._keep_spare()
 
     def accept(self) -> socket.socket | None:
-        """Return the socket of a new client, or None if no client waits or it was turned away."""
+        """Return the socket of a new client, or None if no client waits or it was refused."""
         try:
             end, _ = self.socket.accept()
         except OSError as error:
@@ -105,9 +105,9 @@ class SocketListener:
         self._give_spare()
 
     def _turn_away(self) -> None:
-        """Refuse a client, with the descriptor that is kept for this.
+        """Refuse a client, using the spare descriptor.
 
-        Left in the queue, it would make the socket readable at once, and the loop would never wait.
+        A client left in the queue keeps the socket readable, so the loop would never wait.
         """
         self.turned_away += 1
         self._give_spare()
@@ -134,18 +134,19 @@ class Address(NamedTuple):
 
 
 class ProxyEndpoint:
-    """Endpoint between the two processes of a pair: one dials it, and it dials the other."""
+    """Endpoint between the processes of a pair: one process dials it, and it dials the other."""
 
     def __init__(self, pair: Pair, listener: SocketListener, beyond: Address) -> None:
         self.pair, self.listener = pair, listener
         self.missing = 0
-        """Connections to a process that was not there."""
+        """Number of connections closed because the other process could not be dialled."""
         self._beyond = beyond
 
     def link(self) -> tuple[socket.socket, socket.socket] | None:
         """Accept a client and dial the other process; return both ends, which do not block.
 
-        None unless both are there. The client then sees its connection end, and tries again.
+        Returns None if no client waits, or if the other process cannot be dialled; the client's
+        connection is then closed, and the client retries.
         """
         dialling = self.listener.accept()
         if dialling is None:
@@ -173,9 +174,9 @@ class ProxyEndpoint:
 
 
 def address_of(endpoint: str) -> Address:
-    """Resolve a Zenoh endpoint; BusError if it is neither UNIX socket nor TCP, or unknown.
+    """Resolve an endpoint; raise BusError unless it is a UNIX socket or a resolvable TCP endpoint.
 
-    A name lookup may block, so this is for the start only.
+    Call it only at startup, because a name lookup may block.
     """
     kind, _, rest = endpoint.partition("/")
     if kind == "unixsock-stream":
@@ -187,6 +188,6 @@ def address_of(endpoint: str) -> Address:
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
-        raise BusError(f"{endpoint}: {error}; use a host that can be resolved") from None
+        raise BusError(f"{endpoint}: {error}; name a host that can be resolved") from None
     family, _, _, _, where = found[0]
     return Address(family, where)

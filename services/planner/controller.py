@@ -1,7 +1,7 @@
-"""Interface of a custom controller, and its loading from a file.
+"""Interface of a custom controller, and its loader.
 
 A custom controller replaces the shipped law (docs/own-controller.md), and runs inside the planner:
-in lockstep, live and from the log. Everything around it stays the same: the planner's stance, load,
+in lockstep, live and from the log. Everything around it stays active: the planner's stance, load,
 assist, engagement and trips; the certificate of the local gains
 (`services.planner.watch.controller_guard`); the joint services' age rule, envelope and torque
 limits. Joints are in the order of `shared.joints`; the pose is p = [COM x y z; torso roll pitch
@@ -30,21 +30,23 @@ class Action(NamedTuple):
     """Setpoints for the joint services: arrays (12,).
 
     A joint's torque is D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled; q_ref and tau_ff are
-    extrapolated by the command's age. HOLD keeps q_ref, tau_ff and D, and drops tau_coupled.
+    extrapolated by the command's age. HOLD keeps q_ref and tau_ff, drops v_ref and tau_coupled, and
+    raises some gains to the stand gains.
     """
 
     q_ref: Array
     """rad"""
     v_ref: Array
-    """Rate of q_ref, rad/s. A joint service refuses a q_ref that does not follow it."""
+    """Rate of q_ref, rad/s. An ankle's service refuses a q_ref that does not follow this rate."""
     tau_ff: Array
-    """N m; torque that supports the body without feedback."""
+    """N m; torque that supports the body, without feedback."""
     dtau_ff: Array
     """Rate of tau_ff, N m/s."""
     tau_coupled: Array
-    """N m; all feedback over the whole body. Low-pass it, because the joints flex."""
+    """N m; whole-body feedback. Low-pass it, because the joints flex."""
     D: Array
-    """Local stiffness, N m/rad. It must stand alone; the local damping D_B is the schedule's."""
+    """Local stiffness, N m/rad. It must hold the robot without the planner. The schedule sets the
+    damping D_B."""
 
     @classmethod
     def from_law(cls, law: LawOutput) -> Action:
@@ -53,7 +55,7 @@ class Action(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """Input of a controller at a tick."""
+    """Input of a controller in one tick."""
 
     time_s: float
     """Time since the controller's last reset, s."""
@@ -72,7 +74,7 @@ class Observation(NamedTuple):
     J: Array
     """dp/dq (6, 12)."""
     T: Array
-    """Joint rates per unit of p with closed legs (12, 6), at the law's reference pose."""
+    """Joint rates per unit of p along the closed chain (12, 6), at the law's reference pose."""
     wrench: Wrench | None
     """Wrench of the person on the torso, at the harness, torso axes; None if unknown."""
     request: OperatorRequest
@@ -85,27 +87,27 @@ class Controller(Protocol):
     """Interface of a controller; each planner makes its own instance."""
 
     def reset(self, seen: Observation) -> None:
-        """Start from a pose; called at every tick in which the planner does not lead."""
+        """Start from this state; called at every tick in which the planner does not lead."""
 
     def step(self, seen: Observation) -> Action:
-        """Return the action at a tick in which the planner leads. A period is 4 ms."""
+        """Return the action at a tick in which the planner leads: every 4 ms at 250 Hz."""
 
 
 DEFAULT_NAME: Final = "Controller"
 _SPEC: Final = re.compile(r"(.+\.py)(?::(\w+))?")
 T = TypeVar("T")
 ATTACHED: Final = "controller.py"
-"""Name of the file in a run's log."""
+"""Name under which a run's log contains the controller's file."""
 
 
 def split_spec(spec: str) -> tuple[Path, str]:
-    """Return file and name of `FILE.py` or `FILE.py:NAME`."""
+    """Return the path and the name in a spec, `FILE.py` or `FILE.py:NAME`."""
     match = _SPEC.fullmatch(spec)
     return (Path(match[1]), match[2] or DEFAULT_NAME) if match else (Path(spec), DEFAULT_NAME)
 
 
 def absolute(spec: str) -> str:
-    """Return a spec with an absolute path."""
+    """Return the spec with its path made absolute."""
     path, name = split_spec(spec)
     return f"{path.absolute()}:{name}"
 
@@ -114,9 +116,8 @@ def controller_maker(spec: str, robot: RobotConfig) -> Callable[[], Controller]:
     """Return a function that makes a file's controllers, one for each planner.
 
     Args:
-        spec: `FILE.py` or `FILE.py:NAME`. NAME is called with the robot; the default is
-            `Controller`.
-        robot: the robot.
+        spec: `FILE.py` or `FILE.py:NAME`. NAME is a class or function, by default `Controller`.
+        robot: argument with which NAME is called.
 
     Raises:
         ConfigError: the file cannot be read or run, NAME is missing, or its result is not a
@@ -124,7 +125,8 @@ def controller_maker(spec: str, robot: RobotConfig) -> Callable[[], Controller]:
     """
     path, name = split_spec(spec)
     if not path.is_file() or _SPEC.fullmatch(spec) is None:
-        raise ConfigError(str(path), "--controller", "no such file", "use FILE.py or FILE.py:NAME")
+        found, right = "no such Python file", "use FILE.py or FILE.py:NAME"
+        raise ConfigError(str(path), "--controller", found, right)
     module_spec = importlib.util.spec_from_file_location(f"xrl_controller_{path.stem}", path)
     if module_spec is None or module_spec.loader is None:
         raise ConfigError(
@@ -132,8 +134,8 @@ def controller_maker(spec: str, robot: RobotConfig) -> Callable[[], Controller]:
         )
     module = importlib.util.module_from_spec(module_spec)
     sys.modules[module_spec.name] = module
-    sys.path.append(str(path.absolute().parent))  # for files beside it
-    make = _checked(path, "it", lambda: _executed(module_spec, module, name))
+    sys.path.append(str(path.absolute().parent))  # so it can import its neighbours
+    make = _checked(path, "running it", lambda: _executed(module_spec, module, name))
     if make is None:
         right = f"define a class or function {name}(robot)"
         raise ConfigError(str(path), "--controller", f"has no {name}", right)
@@ -161,5 +163,5 @@ def _checked(path: Path, what: str, run: Callable[[], T]) -> T:
     except Exception as error:
         found = f"{what} raised {type(error).__name__}: {error}"
         raise ConfigError(
-            str(path), "--controller", found, "import it in Python to see the line"
+            str(path), "--controller", found, "run it in Python to see the traceback"
         ) from error

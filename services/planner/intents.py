@@ -1,10 +1,10 @@
 """The operator's newest intent (`operator/intent`), which fades out once stale. Pure.
 
-An intent that is not repeated goes stale: an operator who requested 100 N and left must not be
-lifted forever. It fades out slowly, because somebody may still lean on the robot:
+An intent that is not repeated becomes stale: an operator who requested 100 N and left must not be
+lifted forever. It fades out slowly, because a person may still lean on the robot:
 
     request = intent                                       younger than `assist.stale_ms`
-    request = intent max(0, 1 - (age - stale) / fade)      older; lowering stops at once
+    request = intent max(0, 1 - (age - stale) / fade)      older; `sit` ends at once
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class OperatorRequest(NamedTuple):
     source: str = ""
     """Name of the requester; "" without a request, or if the intent is stale."""
     sit: bool = False
-    """Lower the robot to its lowest pose (`services.planner.law.closed_reference`)."""
+    """Request to lower the robot to its lowest pose (`services.planner.law.closed_reference`)."""
     park: int = Park.AUTO
-    """Request to a robot that may park (`services.planner.watch.park`)."""
+    """`Park`: request about parking, for a robot that may park (`services.planner.watch.park`)."""
 
 
 class Intents:
@@ -49,7 +49,7 @@ class Intents:
             self._received_ns = now_ns
 
     def request(self, now_ns: int) -> OperatorRequest:
-        """Return the request that is valid now."""
+        """Return the present request."""
         late_ns = now_ns - self._received_ns - self._stale_ns
         if late_ns <= 0:
             return self._request

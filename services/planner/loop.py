@@ -34,19 +34,20 @@ class PlannerPorts(msgspec.Struct, frozen=True):
     wrench: Inbox[Wrench]
     attitude: Inbox[Attitude]
     request: Callable[[int], OperatorRequest]
-    """Returns the operator's request at a time of the planner's clock, ns."""
+    """Returns the operator's request at a time on the planner's clock, ns."""
     commands: Sequence[Outbox[JointCommand]]
     status: Outbox[PlannerStatus]
     checkpoint: Outbox[PlannerCheckpoint] | None
     """None if nothing is recorded for re-execution."""
     announce: Callable[[int], None] | None = None
-    """Announces the planner's session, so that joint services on its host detect its end."""
+    """Announces the planner's session, so that joint services on its host detect the planner's
+    end."""
 
 
 def requests_of(
     config: RobotConfig, intents: Inbox[OperatorIntent]
 ) -> Callable[[int], OperatorRequest]:
-    """Return a function that returns the operator's request, from the received intents."""
+    """Return a function of the time, ns, that returns the operator's request."""
     kept = Intents(config.assist)
 
     def request(now_ns: int) -> OperatorRequest:
@@ -61,8 +62,8 @@ def requests_of(
 class _Checkpoints:
     """Schedule of the recorded planner states, from which re-execution can start.
 
-    Due after every tick whose number is a power of two, then once a second. The first ones are
-    frequent, because a recorder discovers a new planner with a short delay.
+    A checkpoint is due after every tick whose number is a power of two, later once a second. The
+    first ones are frequent, because the recorder discovers a new planner after a short delay.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -90,13 +91,13 @@ class _Checkpoints:
 POLL_NS = 200 * NS_PER_US
 """Poll period while expected states are missing, ns."""
 FOLLOW_NS = 20 * NS_PER_US
-"""ns; maximum delay that one late tick adds to the expected time of the next states, so that a tick
-that was held up does not delay the following ones."""
+"""ns; maximum delay that a late tick adds to the expected time of the next states, so that one late
+tick does not delay the following ones."""
 EARLIER_NS, EARLIER_MAX_NS = 40 * NS_PER_US, 400 * NS_PER_US
-"""ns; initial and maximum advance of the expected time after a tick that found all states at its
-first look, because they may have arrived earlier. The advance doubles with each such tick in a row.
-With these values the last state waits 0.12 ms on average if the arrivals spread over 0.5 ms, at 1.9
-looks per tick, and 0.18 ms if they spread over 2 ms."""
+"""ns; initial and maximum advance of the expected time after a tick whose first poll found all
+states, because they may have arrived earlier. The advance doubles with each such tick in a row.
+With these values, the last state waits 0.12 ms on average if the arrivals spread over 0.5 ms, at
+1.9 polls per tick, and 0.18 ms if they spread over 2 ms."""
 
 
 class PlannerLoop:
@@ -129,11 +130,11 @@ class PlannerLoop:
             sleep_until(self._next_look(now, ticked=due))
 
     def _next_look(self, now: int, *, ticked: bool) -> int:
-        """Return the time of the next look for states, ns, after a look at `now`.
+        """Return the time of the next poll for states, ns, after a poll at `now`.
 
-        Each look wakes the process with cold caches, so the loop looks once per period, when the
-        last state is expected, and then every `POLL_NS`. The expected time follows the arrivals:
-        it recovers from an error of a whole period within 15 ticks.
+        Each poll wakes the process with cold caches, so the loop polls once per period, when the
+        last state is expected, and then every `POLL_NS`. The expected time follows the arrivals,
+        and recovers from an error of a whole period within 15 ticks.
         """
         if not ticked:
             self._earlier_ns = 0

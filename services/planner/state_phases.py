@@ -1,14 +1,14 @@
 """Choice of the periods in which modules send their states, so that all six arrive together. Pure.
 
-A module sends its state every nth period of its drive (n = 2: 500 Hz and 250 Hz). The drives share
-no clock, and the modules start counting at different times. If one module sends in its even periods
-and the others in their odd ones, each tick waits for it and uses five states that are a period
-older than necessary. The planner compares the states' arrivals with the first module's. Each
-command names the period in which the module sends its next state (`JointCommand.state_phase`).
-Without a command in time, a module keeps its phase.
+A module sends its state every nth period of its drive (n = 2: 500 Hz and 250 Hz). If the modules
+send in different periods, each tick waits for the last of them (docs/architecture.md#rates). The
+planner compares the states' arrivals with the first module's. Each command names the period in
+which the module sends its next state (`JointCommand.state_phase`). Without a command in time, a
+module keeps its phase.
 
-The planner compares arrivals in the first ticks of each `EVERY_TICKS`. Only then does its loop poll
-continuously; otherwise it sleeps until states are due, so an early state would look late.
+A comparison takes `COMPARED_TICKS` and starts every `SOON_TICKS` to `EVERY_TICKS`. Only then does
+the planner's loop poll continuously; otherwise it sleeps until states are due, so an early state
+would look late.
 """
 
 from __future__ import annotations
@@ -27,14 +27,15 @@ EVERY_TICKS: Final = 1024
 """Maximum number of ticks between two comparisons: 4 s, in which two drives' clocks drift apart by
 at most a fifth of a period (100 ppm)."""
 COMPARED_TICKS: Final = 64
-"""Ticks of a comparison: a quarter of a second, so that no single late message moves a module."""
+"""Ticks of a comparison: a quarter of a second, so that a single late message changes no period."""
 SOON_TICKS: Final = 256
-"""Ticks until the next comparison after a module moved or was silent: a second."""
+"""Ticks until the next comparison after a module changed its period or was silent: a second."""
 SURE: Final = 0.5
-"""Minimum length of a mean direction, 0 .. 1; an even spread over all phases has length 0."""
+"""Minimum length of a module's mean (cos, sin), 0 .. 1, for its period to change; arrivals spread
+evenly over all phases give 0."""
 HYSTERESIS: Final = 0.15
-"""Fraction of a period beyond half a period at which a module moves. The drives' clocks drift past
-one another; without this margin a phase would change back and forth at the boundary."""
+"""Fraction of a period beyond half a period at which a module changes its period. The drives'
+clocks drift past one another. Without this margin, a phase would flap at the boundary."""
 
 
 class PhasesState(msgspec.Struct):
@@ -52,7 +53,7 @@ class PhasesState(msgspec.Struct):
 
 
 class StatePhases:
-    """Phases of six modules."""
+    """Chooses the phases of the six modules."""
 
     def __init__(self, rate_hz: float, state_rate_hz: float) -> None:
         self._n = round(rate_hz / state_rate_hz)
@@ -80,7 +81,7 @@ class StatePhases:
         n, first_ns = self._n, arrived_ns[0]
         if not state.phases:  # start from the last planner's phases
             state.phases = [one.state_phase % n for one in states]
-        compares = self.compares(state) and state.tick > 0  # the loop slept before the first
+        compares = self.compares(state) and state.tick > 0  # the loop slept before tick 0
         state.tick = (state.tick + 1) % state.every
         if not compares:
             return
@@ -92,7 +93,7 @@ class StatePhases:
             self._decide(state, states)
 
     def _decide(self, own: PhasesState, states: Sequence[JointState]) -> None:
-        """Choose the phases and when to compare next: soon if a module moved or was silent."""
+        """Choose the phases and when to compare next: soon after a change or a silent module."""
         n, count = self._n, COMPARED_TICKS - 1
         settled = True
         for module, (state, (x, y)) in enumerate(zip(states, own.sums, strict=True)):

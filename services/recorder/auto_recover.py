@@ -1,7 +1,7 @@
 """Recovers unfinished files of earlier recorders while this one records.
 
-It runs in a thread, because recording must not wait: a file of one hour takes a minute. It leaves
-half of its time to the recorder's loop.
+Recovery runs in a thread, because recovering a file of one hour takes a minute, and recording must
+not wait. The thread leaves half of the time to the recorder's loop.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from shared.mcap_log.recover import Interrupted
 
 
 class AutoRecovery(threading.Thread):
-    """Scans a directory once, then ends; leaves `keep_free` bytes free beside a copy."""
+    """Thread that recovers a directory's unfinished files once.
+
+    It copies a file only if `keep_free` bytes stay free.
+    """
 
     def __init__(self, directory: Path, keep_free: int, logger: logging.Logger) -> None:
         super().__init__(name="auto_recovery", daemon=True)
@@ -29,13 +32,13 @@ class AutoRecovery(threading.Thread):
         self._resumed = time.monotonic()
 
     def halt(self) -> None:
-        """Stop, and wait until that is done; an unfinished copy is deleted, the original stays."""
+        """End the thread and wait for it; an unfinished copy is deleted, the original stays."""
         self._halt.set()
         if self.is_alive():
             self.join()
 
     def run(self) -> None:
-        """Recover one file after the other."""
+        """Recover the files one after the other."""
         for path in sorted(self._directory.glob(f"*{SUFFIX}")):
             if self._halt.is_set():
                 return
@@ -44,13 +47,15 @@ class AutoRecovery(threading.Thread):
             try:
                 recover_in_place(path, self._keep_free, self._logger, self._pace)
             except Interrupted:
-                self._logger.info("%s: recovery continues at the next start", path)
+                self._logger.info(
+                    "%s: recovery interrupted; the next recorder starts it again", path
+                )
                 return
             except (RunError, OSError) as error:
                 self._logger.warning("not recovered: %s", error)
 
     def _pace(self) -> bool:
-        """Sleep for as long as the last piece took; return True if it is time to stop."""
+        """Sleep for as long as the last step took; return True if the thread must stop."""
         stopped = self._halt.wait(time.monotonic() - self._resumed)
         self._resumed = time.monotonic()
         return stopped
@@ -62,9 +67,9 @@ def recover_in_place(
     """Recover one file, if it is unfinished and no process writes it.
 
     A file that was only cut off is replaced by its recovered copy once the copy is on the disk. If
-    there is damage in the middle as well, the original stays and the copy is put beside it. Raises
-    RunError or OSError if the file cannot be read or the copy cannot be written; Interrupted if
-    `stop` returned True.
+    its middle is damaged too, the original stays, and the copy is put beside it. Raises RunError or
+    OSError if the file cannot be read or the copy cannot be written; Interrupted if `stop` returned
+    True.
     """
     beside = recovered_name(path)
     with locked(path) as free:
@@ -72,7 +77,11 @@ def recover_in_place(
             return
         size = path.stat().st_size
         if shutil.disk_usage(path.parent).free < size + keep_free:
-            logger.warning("%s was not finished; there is not enough space to recover it", path)
+            logger.warning(
+                "%s was not finished; there is not enough space to recover it; free some space, "
+                "then run `xrl log recover`",
+                path,
+            )
             return
         outcome = recover.recover(path, beside, stop)
         if not outcome.damage and not outcome.orphans:

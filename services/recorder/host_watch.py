@@ -1,9 +1,8 @@
-"""Watches the recorder's host: free disk space, and which tools are linked.
+"""Watches the free disk space of the recorder's host, and which tools are linked.
 
-No other service has the time for this. When the disk is too full to keep recording, nothing is ever
-deleted. Below the minimum free space, the file is finished while there is still room for its end,
-and recording pauses. Once there is clearly more space, it continues with the run's next file. A run
-that is stopped here does not end the recorder.
+No other service has time for this. Below the minimum free space, the recorder finishes its file
+while there is room for the file's end, and pauses; it deletes nothing. Once there is clearly more
+space, it continues with the run's next file.
 """
 
 from __future__ import annotations
@@ -22,18 +21,18 @@ from shared.clock import NS_PER_MS, NS_PER_S
 MIB: Final = 1 << 20
 
 WARN: Final = 2.0
-"""Multiple of the minimum free space below which it warns."""
+"""Multiple of the minimum free space below which the recorder warns."""
 RESUME: Final = 1.5
 """Multiple of the minimum free space above which recording resumes."""
 CALM: Final = 2.5
-"""Multiple of the minimum free space above which the next shortage warns again."""
+"""Multiple of the minimum free space above which the next shortage causes a new warning."""
 RUN_DIR_MIN_MIB: Final = 16
 """Free space below which the run directory counts as full, MiB: its logs soon lose lines."""
 _EVERY_NS: Final = 2 * NS_PER_S
 
 
 class DiskChange(Enum):
-    """Change at the newest check of the disk."""
+    """Change that the newest disk check found."""
 
     NONE = 0
     LOW = 1
@@ -42,7 +41,7 @@ class DiskChange(Enum):
 
 
 class SpaceGuard:
-    """Judges the free space that it is fed periodically; a minimum of 0 switches it off."""
+    """Compares the free space with a minimum; a minimum of 0 switches the guard off."""
 
     def __init__(self, least_mib: float) -> None:
         self.enough = True
@@ -71,7 +70,7 @@ class SpaceGuard:
 
 
 def free_bytes_at(directory: Path) -> int:
-    """Return the free space where a directory is or will be, bytes; OSError if it is unreadable."""
+    """Return the free bytes where a directory is or will be; raise OSError if they are unknown."""
     while not directory.exists() and directory != directory.parent:
         directory = directory.parent
     found = os.statvfs(directory)
@@ -79,14 +78,14 @@ def free_bytes_at(directory: Path) -> int:
 
 
 class Deadline:
-    """Deadline that passes once per period."""
+    """Periodic deadline."""
 
     def __init__(self, period_ns: int, now: int) -> None:
         self._period_ns = period_ns
         self._due_ns = now + period_ns
 
     def passed(self, now: int) -> bool:
-        """Return True, and start the next period, if this one is over."""
+        """Return True, and start the next period, if the current period is over."""
         if now < self._due_ns:
             return False
         self._due_ns = now + self._period_ns
@@ -101,10 +100,10 @@ class RunDirWatch:
         self._guard = SpaceGuard(RUN_DIR_MIN_MIB)
         self._due = Deadline(_EVERY_NS, now_ns)
         self.trouble = ""
-        """Problem of the run directory's disk; empty without one."""
+        """Problem with the run directory's disk; empty if there is none."""
 
     def check_if_due(self, now_ns: int) -> None:
-        """Check the disk if that is due, and log a warning if it is low."""
+        """Check the disk if that is due, and log a warning if its free space is low."""
         if not self._due.passed(now_ns):
             return
         try:
@@ -116,7 +115,7 @@ class RunDirWatch:
         left = f"{self._run_dir}: {free // MIB} MiB free"
         self.trouble = "" if self._guard.enough else f"{left}: logs lose lines; free some space"
         if change in (DiskChange.LOW, DiskChange.FULL):
-            self._logger.warning("%s: logs lose lines when it is full; free some space", left)
+            self._logger.warning("%s: logs lose lines on a full disk; free some space", left)
 
 
 NEWS_NS: Final = 100 * NS_PER_MS
@@ -124,9 +123,9 @@ NEWS_NS: Final = 100 * NS_PER_MS
 
 
 class Roster:
-    """Publishes twice a second, and at each change, the linked tools and why nothing is recorded.
+    """Publishes the linked tools and the recording's problems twice a second and at each change.
 
-    For `xrl status` and the log. Every tool dials the recorder, so the recorder knows them all.
+    `xrl status` shows them. Every tool connects to the recorder, so the list is complete.
     """
 
     def __init__(self, session: Session) -> None:

@@ -1,6 +1,6 @@
-"""`python -m services.ros2_gateway`: publishes the robot to ROS 2, and passes on accepted requests.
+"""`python -m services.ros2_gateway`: publishes the robot to ROS 2, and forwards accepted requests.
 
-It only publishes, unless `--accept` names what ROS 2 may request.
+Without `--accept` it only publishes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shared.config.files import load
 from shared.joints import MODULES
 
 NICE: Final = 5
-"""Niceness of the gateway, because control goes first."""
+"""Niceness of the gateway, so that control processes run first."""
 DOMAIN_VARIABLE: Final = "ROS_DOMAIN_ID"
 
 
@@ -39,7 +39,10 @@ def main() -> int:
         help=f"domain of the ROS 2 network (default: ${DOMAIN_VARIABLE}, else 0)",
     )
     parser.add_argument(
-        "--accept", type=acceptable, default=(), help="requests accepted from ROS 2: intent,estop"
+        "--accept",
+        type=acceptable,
+        default=(),
+        help="ROS 2 requests to accept: intent, estop or intent,estop (default: none)",
     )
     parser.add_argument("--simulated", action="store_true", help="publish /clock")
     arguments = parser.parse_args()
@@ -64,13 +67,13 @@ def main() -> int:
         except BaseException:
             ros.close()
             raise
-        logger.info("the router answers")
+        logger.info("connected to the router")
         return ros
 
     with bus.open_session(config, "ros2_gateway", arguments.run_dir) as session:
         wanted = [(t, m) for t in INPUTS for m in (MODULES if t.per_module else ("",))]
         inputs: list[Input] = [(t, m, session.latest(t, t.type, m)) for t, m in wanted]
-        link = RosLink(joined, lambda error: logger.warning("%s; reconnecting", error))
+        link = RosLink(joined, lambda error: logger.warning("%s; retrying", error))
         loop = GatewayLoop(gateway, inputs, link)
         if arguments.accept:
             intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
@@ -84,12 +87,14 @@ def main() -> int:
         )
         process.freeze_garbage()
         if time.time_ns() > TIME_LAST_NS:
-            logger.warning("this host's clock is past 2038-01-19: all timestamps will be that day")
+            logger.warning(
+                "this host's clock is past 2038-01-19, where ROS 2 timestamps end: correct it"
+            )
         offset_ns = time.time_ns() - now_ns()
         deadline_ns = now_ns()
         while not stop:
             now = now_ns()
-            # a simulated robot has its own time, maybe in slow motion; a real one the time of day
+            # a simulated robot has its own time, maybe in slow motion; a real robot uses UTC
             loop.cycle(now, now + offset_ns if arguments.simulated else time.time_ns())
             deadline_ns = max(deadline_ns + PERIOD_NS, now)
             sleep_until(deadline_ns)

@@ -33,7 +33,7 @@ else:
 
 
 class RosTypes:
-    """The types of one of `shared.config.checks.ROS2_DISTRIBUTIONS`."""
+    """Message types of a distribution in `shared.config.checks.ROS2_DISTRIBUTIONS`."""
 
     def __init__(self, distribution: str) -> None:
         self._store = typesys.get_typestore(typesys.Stores[f"ROS2_{distribution.upper()}"])
@@ -43,7 +43,7 @@ class RosTypes:
         return self._store.hash_rihs01(type_name)
 
     def make(self, type_name: str, /, **fields: Any) -> Any:
-        """Return a message; `fields` are all of its fields."""
+        """Return a message; `fields` must contain all of its fields."""
         return self._store.types[type_name](**fields)
 
     def encode(self, type_name: str, message: Any) -> bytes:
@@ -58,7 +58,7 @@ class RosTypes:
             return None
 
     def definition(self, type_name: str) -> str:
-        """Return a type's definition, with the types in it, in ROS 2's message language."""
+        """Return a type's definition in ROS 2's message language, with the types that it uses."""
         text, _ = self._store.generate_msgdef(type_name, ros_version=2)
         return text
 
@@ -80,10 +80,10 @@ MODE_LEVEL: Final = {
     Mode.FAULT: ERROR,
 }
 NOT_STOPPED: Final = "emergency stop"
-"""Key of the gateway's figures for a stop of ROS 2 that was given up."""
+"""Key of the gateway's figure that reports a failed emergency stop from ROS 2."""
 TIME_FIRST_NS: Final = 0
 TIME_LAST_NS: Final = (2**31 - 1) * NS_PER_S
-"""Times of ROS 2 are 32-bit seconds since 1970: they end on 2038-01-19."""
+"""ROS 2 times are signed 32-bit seconds since 1970, so they end on 2038-01-19."""
 _UNKNOWN_POSITION: Final = (*LOST_DRIVE, DriveStatus.UNZEROED)
 
 
@@ -105,7 +105,7 @@ class Conversions:
         self._prefix = f"{config.ros2.namespace}/" if config.ros2.namespace else ""
 
     def joint_states(self, ns: int, states: Mapping[str, JointState]) -> bytes:
-        """Return `sensor_msgs/msg/JointState` of modules with a valid position: rad, N m."""
+        """Return `sensor_msgs/msg/JointState` of the modules in `states`, in rad, rad/s and N m."""
         modules = [name for name in MODULES if name in states]
         q, v, tau = (
             np.array([value for name in modules for value in getattr(states[name], part)], float)
@@ -146,7 +146,7 @@ class Conversions:
         return self._encode(TRANSFORMS, transforms=[self._transform(ns, row) for row in rows])
 
     def wrench(self, ns: int, wrench: Wrench) -> bytes:
-        """Return `geometry_msgs/msg/WrenchStamped`: of the person on the torso, at the harness."""
+        """Return `geometry_msgs/msg/WrenchStamped`: the person's wrench on the torso."""
         content = self._types.make(
             "geometry_msgs/msg/Wrench",
             force=self._vector(wrench.force),
@@ -164,9 +164,10 @@ class Conversions:
         wrench: Wrench | None,
         gateway: Mapping[str, object],
     ) -> bytes:
-        """Return `diagnostic_msgs/msg/DiagnosticArray`: a row for each process, silent ones too.
+        """Return `diagnostic_msgs/msg/DiagnosticArray`: a row for each process, even if silent.
 
-        `gateway` has the figures of the gateway itself.
+        The processes are the joint services, planner, harness and gateway. `gateway` contains the
+        gateway's own figures.
         """
         rows = [self._module_row(name, states.get(name)) for name in MODULES]
         rows += [self._planner_row(status), self._harness_row(wrench)]
@@ -194,7 +195,7 @@ class Conversions:
             "drive": DriveStatus(state.drive).name,
             "drive error": f"{state.drive_error:#x}",
             "commands refused": state.refused,
-            "recent drop-outs": state.dropouts,
+            "recent dropouts": state.dropouts,
             "late cycles": f"{state.late} of {state.cycle}",
             "windings, C": f"{state.celsius[0]:.0f}, {state.celsius[1]:.0f}",
             "seconds left at this load": f"{state.heat_left_s:.0f}",
@@ -221,7 +222,7 @@ class Conversions:
     def _harness_row(self, wrench: Wrench | None) -> Any:
         if wrench is None:
             return self._row("harness", STALE, "silent", {})
-        said = "valid" if wrench.valid else "not valid: saturated, stale or without a zero"
+        said = "valid" if wrench.valid else "not valid: saturated, frozen, stale or not tared"
         values = {"age, ms": f"{wrench.age_ns / NS_PER_MS:.1f}", "saturated": wrench.saturated}
         return self._row("harness", OK if wrench.valid else WARN, said, values)
 

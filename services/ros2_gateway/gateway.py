@@ -19,7 +19,7 @@ from shared.robot.robot_urdf import urdf
 STALE_NS: Final = 500 * NS_PER_MS
 """Age above which messages are stale, ns: their sender is dead, suspended or cut off."""
 INPUTS: Final = (topics.JOINT_STATE, topics.PLANNER_STATUS, topics.WRENCH)
-"""Topics of the robot that are received."""
+"""Robot topics that the gateway receives."""
 
 
 class _Outgoing(NamedTuple):
@@ -27,11 +27,11 @@ class _Outgoing(NamedTuple):
 
     topic: RosTopic
     payload: bytes
-    """CDR."""
+    """Message in CDR."""
 
 
 class RosTopics(NamedTuple):
-    """The topics of one robot; those that ROS 2 expects at the root are not in its namespace."""
+    """The topics of one robot; `/tf`, `/diagnostics` and `/clock` are outside its namespace."""
 
     joint_states: RosTopic
     tf: RosTopic
@@ -57,10 +57,10 @@ def topics_of(namespace: str) -> RosTopics:
 
 
 class Gateway:
-    """Turns the robot's newest messages into messages of ROS 2, at its rates (`config.ros2`).
+    """Converts the robot's newest messages to ROS 2, at the rates of `config.ros2`.
 
-    Stale data is not repeated: joint states lack a silent module, and transforms then lack the
-    torso. A simulated robot also publishes the time.
+    Stale data is not repeated: joint states omit a silent module, and transforms then omit the
+    torso. For a simulated robot, the gateway also publishes the time.
     """
 
     def __init__(self, config: RobotConfig, convert: Conversions, *, simulated: bool) -> None:
@@ -80,11 +80,11 @@ class Gateway:
             (topic, round(NS_PER_S / rate_hz), make) for topic, rate_hz, make in sends if rate_hz
         ]
         self.figures: Callable[[], Mapping[str, object]] = dict
-        """Called for each `/diagnostics`; returns the gateway's own figures."""
+        """Called for each `/diagnostics` message; returns the gateway's own figures."""
 
     @property
     def sent_topics(self) -> list[RosTopic]:
-        """Topics that have a rate, and the description."""
+        """Topics that have a rate, and that of the description."""
         return [*(topic for topic, _, _ in self._sends), self.topics.description]
 
     def description(self) -> _Outgoing:
@@ -92,11 +92,11 @@ class Gateway:
         return _Outgoing(self.topics.description, self._convert.text(urdf(self._config)))
 
     def receive(self, topic: Topic, module: str, message: Message, now_ns: int) -> None:
-        """Store a message of the robot that has arrived."""
+        """Store a message that has arrived from the robot."""
         self._newest[topic, module] = now_ns, message
 
     def due(self, now_ns: int, unix_ns: int) -> list[_Outgoing]:
-        """Return what is due now; `unix_ns` is for ROS 2, `now_ns` on the clock of `receive`."""
+        """Return the due messages, with time stamps `unix_ns`; `now_ns` is on `receive`'s clock."""
         found = []
         for topic, period_ns, make in self._sends:
             due_ns = self._next_ns.get(topic, now_ns)

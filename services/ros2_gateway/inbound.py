@@ -1,4 +1,4 @@
-"""Requests of ROS 2 to the robot, if accepted: assist and the emergency stop. Pure."""
+"""Requests from ROS 2 to the robot, if accepted: assist and the emergency stop. Pure."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from shared.config.scenarios import SCENARIO
 from shared.exceptions import FleetError
 
 SOURCE: Final = "ros2_gateway"
-"""Name of the sender, on the robot's bus."""
+"""Name of the sender on the robot's bus."""
 ACCEPTABLE: Final = ("estop", "intent")
-"""Words of `--accept`, the stop first."""
+"""Values of `--accept`; the stop is processed first."""
 STOPPED: Final = (Mode.DAMP, Mode.FAULT)
 REPEAT_NS: Final = 50 * NS_PER_MS
 GIVE_UP_NS: Final = 5 * NS_PER_S
-"""Maximum time for which a stop is repeated while modules have not stopped, ns."""
+"""Maximum time for which a stop is repeated until every module has stopped, ns."""
 
 
 class _InboundTopics(NamedTuple):
     """Topics of a robot that ROS 2 may publish."""
 
     estop: RosTopic
-    """`std_msgs/msg/Bool`: true stops every module; nothing here ends a stop."""
+    """`std_msgs/msg/Bool`: true stops every module; false does not end a stop."""
     intent: RosTopic
-    """`std_msgs/msg/Float64`: assist, N; must be repeated, as `assist.stale_ms` says."""
+    """`std_msgs/msg/Float64`: assist, N; must be repeated within `assist.stale_ms`."""
 
 
 def inbound_topics(namespace: str) -> _InboundTopics:
@@ -42,7 +42,7 @@ def inbound_topics(namespace: str) -> _InboundTopics:
 
 
 def acceptable(words: str) -> tuple[str, ...]:
-    """Parse `--accept`, such as `intent,estop`; FleetError for anything else."""
+    """Parse the value of `--accept`, such as `intent,estop`; raise FleetError if it is invalid."""
     names = [word for word in words.split(",") if word]
     if not names or not set(names) <= set(ACCEPTABLE):
         raise FleetError(f"--accept {words}: must be intent, estop or intent,estop")
@@ -59,12 +59,13 @@ class Inbound:
         self._stop_since_ns: int | None = None
         self._next_stop_ns = 0
         self.refused = 0
-        """Messages that could not be read, or requested the impossible."""
+        """Number of messages that were unreadable or out of range, or came while another operator
+        was in control."""
         self.not_stopped = False
         """True if the last stop was given up before every module had stopped."""
 
     def receive(self, topic: RosTopic, message: Any | None, now_ns: int) -> None:
-        """Process a message of one of `inbound_topics`; None if it could not be read."""
+        """Process a message of one of `inbound_topics`; an undecodable `message` is None."""
         if message is None:
             self.refused += 1
         elif topic == self._topics.estop:
@@ -79,10 +80,9 @@ class Inbound:
     def intent(
         self, now_ns: int, number: int, status: PlannerStatus | None
     ) -> OperatorIntent | None:
-        """Return a new intent, once; None without one, or if another operator leads.
+        """Return a new intent once; None if there is none, or if another operator is in control.
 
-        `number` is the count of intents sent so far; `status` shows whose intent the planner
-        follows.
+        `number` becomes its sequence number; `status` shows whose intent the planner follows.
         """
         assist_n, self._assist_n = self._assist_n, None
         if assist_n is None:
@@ -95,8 +95,9 @@ class Inbound:
     def stop_due(self, now_ns: int, modes: Sequence[tuple[int, int]], of: int) -> bool:
         """Return True if the stop must be published now.
 
-        `modes` has when each module's newest state arrived, ns, and its mode. States from before
-        the request do not count, because a module may have been silent since.
+        `modes` are arrival time, ns, and mode of each module's newest state. States older than the
+        request do not count, because a module may have been silent since. `of` is the number of
+        modules.
         """
         since_ns = self._stop_since_ns
         if since_ns is None:

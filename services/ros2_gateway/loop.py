@@ -1,4 +1,4 @@
-"""The gateway's loop: takes the robot's newest messages, and publishes what is due to ROS 2."""
+"""Loop of the gateway: reads the robot's newest messages and publishes them to ROS 2 when due."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.ros2_gateway.inbound import SOURCE, Inbound
 from services.ros2_gateway.rmw import RosTopic
 from services.ros2_gateway.ros_session import RosLink
 from shared.bus.messages import Estop, JointState, OperatorIntent, PlannerStatus
-from shared.bus.session import Latest, Publisher
+from shared.bus.pubsub import Latest, Publisher
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS
 from shared.joints import N_MODULES
@@ -23,7 +23,7 @@ Input = tuple[Topic, str, "Latest[Any]"]
 
 
 class GatewayLoop:
-    """One cycle of the gateway."""
+    """Runs the gateway, one cycle per call."""
 
     def __init__(self, gateway: Gateway, inputs: Sequence[Input], link: RosLink) -> None:
         self._gateway, self._inputs, self._link = gateway, inputs, link
@@ -32,13 +32,13 @@ class GatewayLoop:
         self._intents: Publisher[OperatorIntent] | None = None
         self._stops: Publisher[Estop] | None = None
         self._modes: dict[str, tuple[int, int]] = {}
-        """By module: when its newest state arrived, ns, and its mode."""
+        """Arrival time, ns, and mode of each module's newest state."""
         self._status: PlannerStatus | None = None
         self.cycles = 0
         self.sent = 0
-        """Messages to ROS 2."""
+        """Number of messages sent to ROS 2."""
         self.passed = 0
-        """Messages from ROS 2 to the robot."""
+        """Number of messages forwarded from ROS 2 to the robot."""
 
     def accept(
         self, inbound: Inbound, intents: Publisher[OperatorIntent], stops: Publisher[Estop]
@@ -47,7 +47,7 @@ class GatewayLoop:
         self._inbound, self._intents, self._stops = inbound, intents, stops
 
     def cycle(self, now_ns: int, unix_ns: int) -> None:
-        """Run one cycle; `unix_ns` is the same moment as `now_ns`, ns since 1970."""
+        """Run one cycle; `unix_ns` is the time `now_ns` in ns since 1970."""
         for topic, module, latest in self._inputs:
             message = latest.take()
             if message is None:

@@ -8,7 +8,7 @@ The contract is the design page of rmw_zenoh, as of the distribution Jazzy:
                 /<topic>/<DDS type>/<type hash>/<QoS>
     attachment  sequence number, time (int64, little endian), length of the GID, GID
 
-In tokens each / of a name is written %.
+In tokens, each / in a name is written as %.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ Kind: TypeAlias = Literal["MP", "MS"]
 
 
 class Qos(NamedTuple):
-    """Quality of service of an endpoint, as far as it is announced to others."""
+    """Quality of service that an endpoint announces."""
 
     reliable: bool = True
     transient_local: bool = False
-    """True if a later subscription gets the newest messages."""
+    """True if a new subscription receives the newest messages."""
     depth: int = 10
-    """Messages that are kept."""
+    """Maximum number of stored messages."""
 
     def encode(self) -> str:
-        """Return it as in a token; values that are rmw's default stay empty."""
+        """Return the text for a token, in which rmw's default values are empty."""
         reliability = "" if self.reliable else "2"
         durability = "1" if self.transient_local else ""
         return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
@@ -65,9 +65,9 @@ class RosNode(NamedTuple):
 
 
 def domain(text: str) -> int:
-    """Return a domain from a command line; ArgumentTypeError outside 0 to 232."""
+    """Parse a domain of a command line; raise ArgumentTypeError unless it is 0 to 232."""
     if not (text.strip().isdecimal() and int(text) <= DOMAIN_MAX):
-        raise argparse.ArgumentTypeError(f"{text[:40]!r}: must be between 0 and {DOMAIN_MAX}")
+        raise argparse.ArgumentTypeError(f"{text[:40]!r}: must be a number from 0 to {DOMAIN_MAX}")
     return int(text)
 
 
@@ -78,7 +78,7 @@ def dds_type(name: str) -> str:
 
 
 def topic_key(domain: int, topic: RosTopic, type_hash: str) -> str:
-    """Return the key on which a topic's messages are put."""
+    """Return the key on which a topic's messages are published."""
     return f"{domain}/{topic.name.strip('/')}/{dds_type(topic.type)}/{type_hash}"
 
 
@@ -91,7 +91,7 @@ def node_token(node: RosNode) -> str:
 def endpoint_token(node: RosNode, number: int, kind: Kind, topic: RosTopic, type_hash: str) -> str:
     """Return the key of the liveliness token of a node's publisher or subscription.
 
-    `number` is that of the endpoint within its session.
+    `number` identifies the endpoint within its session.
     """
     place = f"{ADMIN_SPACE}/{node.domain}/{node.session}/0/{number}/{kind}"
     names = f"%/{_mangled(node.namespace)}/{node.name}/{_mangled(topic.name)}"
@@ -112,7 +112,7 @@ class SeenEndpoint(NamedTuple):
     """A node or an endpoint, as read from its token."""
 
     kind: str
-    """NN, MP, MS, SS or SC."""
+    """NN (node), MP or MS (publisher or subscription), SS or SC (service or client)."""
     node: str
     """Full name of the node."""
     topic: str = ""

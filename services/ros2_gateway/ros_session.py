@@ -20,8 +20,8 @@ from shared.exceptions import BusError
 NODE: Final = "xrl"
 """Name of the gateway's node."""
 _SETTINGS: Final[dict[str, object]] = {
-    # A router forwards everything to a client, and a client that has lost it dials it again. Two
-    # peers cannot connect if both listen nowhere, or on another host's loopback as ROS 2's do.
+    # A router forwards everything to a client, and the client redials a lost router. Peers cannot
+    # connect: this one listens nowhere, and those of ROS 2 listen on their own host's loopback.
     "mode": "client",
     "scouting/multicast/enabled": False,
     "connect/timeout_ms": 1000,
@@ -41,17 +41,17 @@ class RosSession:
     def __init__(
         self, router: str, domain: int, types: RosTypes, *, namespace: str = "", name: str = NODE
     ) -> None:
-        """Open the session at the router's endpoint; takes up to a second.
-
-        BusError if no router answers.
-        """
+        """Connect to the router; raise BusError if none answers within a second."""
         config = zenoh.Config()
         for key, value in {**_SETTINGS, "connect/endpoints": [router]}.items():
             config.insert_json5(key, json.dumps(value))
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise BusError(f"{router}: no ROS 2 router answers: {error}") from None
+            raise BusError(
+                f"{router}: no ROS 2 router answers: {error}; start one "
+                "(ros2 run rmw_zenoh_cpp rmw_zenohd), or correct ros2.router"
+            ) from None
         self._types, self._domain = types, domain
         self._node = RosNode(domain, str(self._session.zid()), f"/{namespace}", name)
         self._tokens: list[zenoh.LivelinessToken] = []
@@ -59,7 +59,7 @@ class RosSession:
         self._subscribers: list[tuple[RosTopic, _Subscriber]] = []
         self._endpoints = 0
         self.failed = 0
-        """Messages that could not be sent."""
+        """Number of messages that could not be sent."""
 
     def __enter__(self) -> Self:
         """Return the session."""
@@ -70,12 +70,12 @@ class RosSession:
         self.close()
 
     def close(self) -> None:
-        """Leave the network; node and topics disappear from its graph."""
+        """Leave the network; its graph then no longer shows the node and its topics."""
         with contextlib.suppress(zenoh.ZError):  # it timed out; the process ends anyway
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
 
     def show_node(self) -> None:
-        """Appear in the graph as a node."""
+        """Announce the node in the graph."""
         self._show(rmw.node_token(self._node))
 
     def publish(self, topics: Sequence[RosTopic]) -> None:
@@ -94,7 +94,7 @@ class RosSession:
             self._publishers[topic] = _RosPublisher(publisher, rmw.gid_of(token))
 
     def subscribe(self, topics: Sequence[RosTopic]) -> None:
-        """Declare subscriptions of topics."""
+        """Declare subscriptions to topics."""
         for topic in topics:
             type_hash = self._types.hash(topic.type)
             key = rmw.topic_key(self._domain, topic, type_hash)
@@ -110,10 +110,10 @@ class RosSession:
             self.failed += 1
 
     def take(self) -> list[tuple[RosTopic, Any | None]]:
-        """Return the messages since the last call; None for one that could not be read."""
+        """Return the messages since the last call; None for each that could not be decoded."""
         found = []
         for topic, subscriber in self._subscribers:
-            for _ in range(_QUEUE):  # limited, so a flood of one does not starve the next
+            for _ in range(_QUEUE):  # limited, so a flood on one topic does not starve the next
                 sample = subscriber.try_recv()
                 if sample is None:
                     break
@@ -139,10 +139,10 @@ class RosSession:
 
 
 class RosLink:
-    """Opens a session in its own thread, and retries until the router is there.
+    """Opens a session in its own thread, and retries until the router answers.
 
-    `opened` opens and declares, and raises without a router; `failed` is called with the first
-    failure.
+    `opened` opens the session and declares its topics, and raises if no router answers. `failed`
+    is called with the first failure.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class RosLink:
         self._open, self._failed = opened, failed
         self._left = threading.Event()
         self.session: RosSession | None = None
-        """The session, once it is open; it then lasts, even if its router does not."""
+        """The session once it is open, else None; it stays open even if its router ends."""
         self._thread = threading.Thread(target=self._dial, name="ros2-router", daemon=True)
         self._thread.start()
 

@@ -31,17 +31,17 @@ DEFAULT_SCENARIO = SCENARIOS / "stand.toml"
 
 
 def main() -> int:
-    """Wire the world to the emulated drives and the bus and run it."""
+    """Connect the world to the emulated drives and the bus, and run it; return the exit code."""
     parser = service_parser(
         "Simulate the robot, its drives and its operator.",
         "python -m services.simulator --scenario deploy/scenarios/squat.toml",
     )
-    parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, help="scenario (TOML)")
+    parser.add_argument("--scenario", type=Path, default=DEFAULT_SCENARIO, help="scenario file")
     parser.add_argument(
         "--autostart",
         type=float,
         metavar="S",
-        help="start the scenario S seconds after the hoist is down (default: at a bus message)",
+        help="start the scenario S seconds after the hoist is down (default: at a tool's request)",
     )
     parser.add_argument(
         "--plant",
@@ -56,7 +56,7 @@ def main() -> int:
         type=float,
         default=0.0,
         metavar="M",
-        help="hang the robot M metres higher, its feet clear of the floor (0: soles on it)",
+        help="hang the robot with its soles M metres above the floor (default: 0)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the sensors' noise")
     arguments = parser.parse_args()
@@ -101,7 +101,6 @@ def main() -> int:
 
 
 def _open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str, UnixCanHub]:
-    """Return the robot's simulated CAN buses by name."""
     make_live_dir(run_dir)
     sensors = [robot.harness.bus, *([robot.imu.bus] if robot.imu.fitted else [])]
     hubs = {
@@ -116,9 +115,9 @@ def _open_hubs(robot: RobotConfig, run_dir: Path, stack: ExitStack) -> dict[str,
 def _open_usb(
     robot: RobotConfig, bank: AxisBank, run_dir: Path, stack: ExitStack
 ) -> list[FibreHub]:
-    """Return the drives' USB plugs, in {run}/usb, for the modules that have serial numbers.
+    """Return the USB ports of the modules with serial numbers, in `FOLDER` of the live directory.
 
-    An ODrive v3 has USB and CAN, so the plugs exist whichever the services use.
+    An ODrive v3 has USB and CAN, so the ports exist even if the services use CAN.
     """
     folder = live_dir(run_dir) / FOLDER
     ports: list[FibrePort] = []

@@ -1,4 +1,4 @@
-"""The simulator's loop: drives, world and sensors in real time; it waits for no service."""
+"""Loop of the simulator: steps drives, world and sensors in real time, and waits for no service."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from services.simulator.fronts.cansimple_front import CanSimpleFront
 from services.simulator.fronts.fibre_port import FibreHub
 from services.simulator.robot import SimulatedRobot
 from shared.bus.messages import HandLead, OperatorIntent, SimControl, Vector4
-from shared.bus.session import Latest, Publisher
+from shared.bus.pubsub import Latest, Publisher
 from shared.bus.traces import SimState, SimTruth
 from shared.can.cansimple import AxisState
 from shared.clamp import clamp
@@ -21,7 +21,7 @@ from shared.config.scenarios import SCENARIO
 from shared.process import StopFlag
 
 SILENT_INTENTS: Final = 250
-"""Number of the scenario's intents to skip after another operator's last, until it has faded."""
+"""Number of scenario intents skipped after another operator's last intent, until it has faded."""
 
 
 class SimulatorPorts(msgspec.Struct, frozen=True):
@@ -48,7 +48,7 @@ class Pace(msgspec.Struct):
 def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tuple[float, Vector4]:
     """Return the assist, N, and the shift, clamped to what the planner would grant.
 
-    Without the clamp, a request of 1e9 N made the simulated person rest 1e9 N on the robot.
+    Without the clamp, the simulated person would load the robot with 1e9 N on request.
     """
     x, y, roll, yaw = (
         clamp(part, -most, most) for part, most in zip(asked.shift, shift_max, strict=True)
@@ -57,7 +57,7 @@ def granted(asked: OperatorIntent, assist_max: float, shift_max: Vector4) -> tup
 
 
 class SimulatorLoop:
-    """Loop that steps twelve emulated axes and the world at the pace of the clock.
+    """Loop that steps twelve emulated axes and the world in real time.
 
     The drives receive and send at the rate of their encoder frames. In torque mode they hold their
     torque between frames; in position or velocity mode they step with the world.
@@ -116,7 +116,7 @@ class SimulatorLoop:
             sleep_until(due)
 
     def step(self) -> None:
-        """Apply the drives' frames, advance the world by one step, send the due messages."""
+        """Exchange the drives' frames, advance the world by one step, and send the due messages."""
         robot, front, every = self._robot, self._front, self._every
         begins_ns = self._steps * every.step
         if begins_ns % every.encoders == 0:
@@ -175,7 +175,7 @@ class SimulatorLoop:
         self._ports.intent.put(intent)
 
     def _publish_truth(self) -> None:
-        """Publish the truth; at the same rate, handle requests, the start and the hoist."""
+        """Publish the true state; at this rate, also handle requests, scenario start and hoist."""
         world, pace, now = self._world, self._pace, now_ns()
         control, hand = self._ports.control.take(), self._ports.hand.take()
         if hand is not None:

@@ -30,7 +30,7 @@ from shared.joints import MODULE_INDEX, N_JOINTS
 
 INTENT_RATE_HZ: Final = 50.0
 _COLUMNS: Final = ("input_pos", "input_vel", "input_torque", "pos_gain", "vel_gain", "counts_from")
-"""Arrays of the bank that `SimState` holds by the same names."""
+"""Arrays of the bank that `SimState` stores under the same names."""
 
 
 class Periods(NamedTuple):
@@ -72,7 +72,7 @@ class SimulatedRobot:
 
     Attributes:
         harness: the load cells.
-        imu: None if no IMU is fitted.
+        imu: the IMU; None if none is fitted.
         every: periods of the periodic exchanges.
     """
 
@@ -92,7 +92,7 @@ class SimulatedRobot:
         Args:
             config: the robot file.
             plant: how the true robot differs from it.
-            scenario: course of the run, with the faults of drives.
+            scenario: course of the run, including drive faults.
             cells: CAN bus of the load cells.
             imu: CAN bus of the IMU; None if no IMU is fitted.
             seed: seed of the sensors' noise.
@@ -116,7 +116,7 @@ class SimulatedRobot:
         return self._faults.advance(self.world.scenario_s)
 
     def step_drives(self) -> None:
-        """Step the axes: at each encoder sample, and at each step of the world if they regulate."""
+        """Step the axes; call it per encoder sample, and per step of the world if they regulate."""
         self._torque = self.bank.step(self.world.time, *self.world.motor_turns())
 
     def step_world(self) -> None:
@@ -149,7 +149,7 @@ class SimulatedRobot:
     def write_state(self, state: SimState) -> None:
         """Continue from a state of the same robot and scenario; this robot must be new.
 
-        The state lacks errors and conditions of the drives: an axis that is not armed is idle.
+        The state contains no errors or conditions of drives, so an axis that is not armed is idle.
         """
         world, bank = self.world, self.bank
         world.resume(state)
@@ -164,24 +164,24 @@ class SimulatedRobot:
 
 
 _AT_ONCE: Final = {"watchdog": "WATCHDOG", "disarmed": "DISARM", "overspeed": "OVERSPEED"}
-"""Momentary kinds of faults, with the bank's name for each."""
+"""Momentary fault kinds, each with its name in `FAULTS` of the drives."""
 _PULSED: Final = {"bus_full": (0.04, 0.1), "bus_flap": (0.06, 0.15)}
-"""Lasting kinds that come and go: duration and period, s."""
+"""Lasting fault kinds that pulse: duration and period of a pulse, s."""
 _ABOVE: Final = 5.0
-"""V or C beyond the limit."""
+"""Excess of an injected voltage or temperature over its limit, V or C."""
 
 
 class FaultInjector:
-    """The faults of a run, and which of them have started."""
+    """Starts and ends the faults of a run."""
 
     def __init__(self, faults: Sequence[Fault], bank: AxisBank) -> None:
-        """Take the faults in any order."""
+        """Prepare the faults, which may be in any order."""
         self._bank = bank
         self._coming = sorted(faults, key=lambda fault: fault.at)
         self._lasting: list[Fault] = []
 
     def advance(self, scenario_s: float) -> list[Fault]:
-        """Start and end the faults due at scenario time; return those that started."""
+        """Start and end the faults due at a scenario time; return those that started."""
         if not self._coming and not self._lasting:
             return []
         for fault in [row for row in self._lasting if scenario_s >= row.at + row.lasts_s]:
@@ -202,7 +202,6 @@ class FaultInjector:
         return begun
 
     def _act(self, fault: Fault, *, begins: bool) -> None:
-        """Start or end a lasting fault of a drive."""
         bank, axis = self._bank, _axis_of(fault)
         drive = axis >> 1
         match fault.kind:

@@ -25,8 +25,8 @@ def encode(message: Message) -> bytes:
     """Return the JSON of a message.
 
     Raises:
-        NonFiniteError: a number is NaN or infinite. msgspec writes it as null, which no message's
-            type allows, since no field is optional.
+        NonFiniteError: a number is NaN or infinite. msgspec writes it as null, which no message
+            type allows, because no field is optional.
         EncodeError: a value has no JSON form, or an integer has more than 64 bits.
     """
     try:

@@ -36,7 +36,7 @@ class Names(Section, frozen=True):
 
 
 class Credentials(NamedTuple):
-    """Certificate and key of one process, and what it trusts."""
+    """Certificate and key of one process, and the names that it trusts."""
 
     name: str
     """One of `PRINCIPALS`."""
@@ -47,7 +47,7 @@ class Credentials(NamedTuple):
 
 
 def keys_folder(robot: RobotConfig) -> Path:
-    """Return the folder that `bus.security.keys` names; XrlError if this user has no such home."""
+    """Return the folder `bus.security.keys`; raise XrlError if its `~` names no existing home."""
     return in_home(filled(robot.bus.security.keys, {ROBOT: robot.name}))
 
 
@@ -62,7 +62,7 @@ def key_file(folder: Path, name: str) -> Path:
 
 
 def read_names(folder: Path) -> Names:
-    """Read `names.toml` of a folder; BusError if it is missing or invalid."""
+    """Read `names.toml` of a folder; raise BusError if it is missing or invalid."""
     file = folder / NAMES
     if not file.is_file():
         raise BusError(f"{folder}: no keys for `mtls` here ({NAMES} is missing); {_HELP}")
@@ -78,7 +78,7 @@ def read_names(folder: Path) -> Names:
 
 
 def held_names(folder: Path) -> frozenset[str]:
-    """Return the current names whose private keys a folder holds; BusError as `read_names`."""
+    """Return the current names whose private keys a folder holds; raise as `read_names` does."""
     return frozenset(n for n in read_names(folder).generations if key_file(folder, n).exists())
 
 
@@ -92,7 +92,7 @@ def read_credentials(robot: RobotConfig, process: str) -> Credentials:
     names = read_names(folder)
     if names.robot != robot.name:
         raise BusError(
-            f"{folder}: these are the keys of robot {names.robot!r}, not of {robot.name!r}"
+            f"{folder}: these are the keys of robot {names.robot!r}, not of {robot.name!r}; {_HELP}"
         )
     wanted = (process,) if process in SERVICES else (OPERATOR, VIEWER)
     name = next((name for name in wanted if key_file(folder, name).exists()), wanted[-1])
@@ -101,14 +101,14 @@ def read_credentials(robot: RobotConfig, process: str) -> Credentials:
     for file in (credentials.certificate, credentials.key, credentials.authority):
         if not file.is_file():
             raise BusError(
-                f"{file}: missing: this host has no key for {' or '.join(wanted)}; {_HELP}"
+                f"{file}: missing: this process needs the key of {' or '.join(wanted)}; {_HELP}"
             )
     check_private(credentials.key)
     return credentials
 
 
 def require_operator(robot: RobotConfig, process: str) -> None:
-    """Check that modules accept what this host sends; only `mtls` identifies senders.
+    """Check that this host has an operator's key under `mtls`; other modes identify no sender.
 
     Raises BusError if this host has no key, FleetError if the key is not an operator's.
     """
@@ -116,7 +116,10 @@ def require_operator(robot: RobotConfig, process: str) -> None:
         return
     name = read_credentials(robot, process).name
     if name != OPERATOR:
-        raise FleetError(f"this host has the key of a {name}; this command needs an operator's key")
+        raise FleetError(
+            f"this host has the key of a {name}; this command needs an operator's key, from "
+            "`xrl keys pack` (docs/security.md)"
+        )
 
 
 def check_private(key: Path) -> None:

@@ -1,8 +1,8 @@
 """Every message on the bus (docs/networks.md).
 
-Payloads are JSON by msgspec. SI units; times are integers in ns; enumerations are integers. No
-field is optional, so a `null` in a payload can only be a number that was not finite.
-`shared.bus.codec` refuses it at both ends.
+Payloads are JSON, encoded by msgspec, in SI units; times are integers in ns, and enumerations are
+integers. No field is optional, so a `null` in a payload is always a number that was not finite;
+`shared.bus.codec` refuses it on both sides.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Annotated, Final
 import msgspec
 
 Int64 = Annotated[int, msgspec.Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-"""64-bit integer. Decoding refuses larger ones, which would raise where they first meet a float."""
+"""64-bit integer. Decoding refuses larger ones, because converting them to float could raise."""
 Pair = tuple[float, float]
 """(phi, theta) of one module."""
 Vector3 = tuple[float, float, float]
@@ -24,7 +24,7 @@ LEFT_MAX_S = 3600.0
 STRAIGHT: Vector4 = (0.0, 0.0, 0.0, 0.0)
 """No shift of x, y, roll and yaw."""
 AS_CONFIGURED: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Feet where the robot file has them."""
+"""No displacement of the feet from the robot file."""
 Modules = tuple[Int64, Int64, Int64, Int64, Int64, Int64]
 """One integer per module, in `shared.joints.MODULES` order."""
 
@@ -33,15 +33,15 @@ class Mode(IntEnum):
     """Mode of a joint service (docs/architecture.md#modes)."""
 
     DISARMED = 0
-    """No torque; drive not armed."""
+    """The service applies no torque."""
     HOLD = 1
-    """References frozen; stands on local gains."""
+    """Stands with local gains and frozen references."""
     TRACK = 2
     """Follows the planner's commands."""
     DAMP = 3
     """Sinks slowly after an emergency stop; only damps after a fall."""
     FAULT = 4
-    """Drive or position lost; only a restart leaves it."""
+    """Drive disarmed, or drive or position lost; only a restart ends it."""
 
 
 class Cause(IntEnum):
@@ -55,16 +55,16 @@ class Cause(IntEnum):
     COMMAND_STALE = 3
     """The newest command is too old."""
     HOLD_ALL = 4
-    """The planner requests HOLD from all six modules."""
+    """The planner requests HOLD."""
     ESTOP = 5
     DRIVE_LOST = 6
     """No frames from the drive."""
     DRIVE_DISARMED = 7
     """The drive left closed loop on its own."""
     POSITION_LOST = 8
-    """The drive is unzeroed, or its samples jump."""
+    """The drive has no zero, or its count may be wrong."""
     SHAKING = 9
-    """Shaking trip (`shared.robot.trip_table`)."""
+    """Shaking trip (`xrl faults`)."""
     TORQUE_LIMIT = 10
     """Torque trip."""
     TOO_FAST = 11
@@ -76,37 +76,25 @@ class Cause(IntEnum):
 
 
 class Trip(IntEnum):
-    """Limit that keeps the planner from leading (`shared.robot.trip_table`)."""
+    """Trip of the planner; `xrl faults` explains each."""
 
     NONE = 0
     LEGS = 1
-    """Legs disagree about the torso's pose."""
     REACH = 2
-    """Reference pose out of reach."""
     TRACKING = 3
-    """A joint is far from its reference."""
     UNLOADED = 4
-    """A leg carries hardly any load."""
     SINKING = 5
-    """COM sinks or rises too fast."""
     TURNING = 6
-    """Torso turns too fast."""
     HARNESS = 7
-    """Harness force far from the requested assist."""
     SAGGING = 8
-    """Person sinks with weight on the harness."""
     UNATTENDED = 9
-    """Robot drifts with nobody holding it."""
     EDGE = 10
-    """Load near a sole's edge: a lean from the side."""
     TIPPING = 11
-    """Load at a sole's edge: a shove from the side."""
     OFF_BALANCE = 12
-    """COM far ahead of or behind its reference."""
 
 
 class Outside(IntEnum):
-    """Value of a command that lies outside the envelope (`services.joint.envelope`)."""
+    """Violated bound of the envelope (`services.joint.envelope`)."""
 
     NOTHING = 0
     K_P = 1
@@ -115,12 +103,12 @@ class Outside(IntEnum):
     DTAU_FF = 4
     TAU_COUPLED = 5
     Q_REF = 6
-    """Too far from the joint's position."""
+    """Too far from the joint's angle."""
     V_REF = 7
     TORQUE_STEP = 8
-    """Faster than the law changes the torque."""
+    """Torque changes too fast."""
     MARGIN = 9
-    """Below the planner's minimum."""
+    """Below `certificate.margin_min` or `certificate.onboard_margin_min`."""
     COUPLED_WORK = 10
     """Coupled torque drives the joint away from its reference."""
     Q_REF_ASTRAY = 11
@@ -137,36 +125,36 @@ class Refusal(IntEnum):
     TOO_OLD = 1
     """Echoes a state that is too old."""
     FROM_THE_FUTURE = 2
-    """Echoes a state that this module has not sent yet."""
+    """Echoes a stamp later than this module's clock."""
     FOREIGN_SESSION = 3
-    """From another planner, or one that this module has left."""
+    """Session of another planner, or one that the module has left."""
     NOT_NEWER = 4
-    """Sequence number not above the last accepted."""
+    """Sequence number not above the last accepted one."""
     OUT_OF_LIMITS = 5
-    """Not finite, or beyond the joint service's limits."""
+    """Beyond the joint service's limits."""
     OUT_OF_ENVELOPE = 6
     """See `Outside`."""
     TOO_FAR_AHEAD = 7
-    """Sequence number that no planner can have reached."""
+    """Implausibly high sequence number."""
     MALFORMED = 8
-    """No JSON, a wrong field, or a number that is not finite; has no session."""
+    """Not the JSON of a command; its session is unknown."""
 
 
 class DriveStatus(IntEnum):
-    """Status of a module's two axes together."""
+    """Combined status of both axes."""
 
     LOST = 0
     """No frames, or the link is down."""
     IDLE = 1
-    """Both axes answer without error, but not both are in closed loop."""
+    """No error, but at least one axis is not in closed loop."""
     ARMED = 2
     """Both axes in closed loop."""
     ERROR = 3
     """An axis reports an error or left closed loop on its own."""
     UNZEROED = 4
-    """Both axes answer; the zero was lost with the power."""
+    """Both axes answer, but the zero is missing."""
     HOLDING = 5
-    """Left in closed loop by an earlier service; waits for the take-over."""
+    """In closed loop since an earlier service, and not taken over."""
     UNACKNOWLEDGED = 6
     """Lost; no node acknowledges frames."""
 
@@ -176,52 +164,53 @@ LOST_DRIVE: Final = (DriveStatus.LOST, DriveStatus.UNACKNOWLEDGED)
 
 
 class PlannerMode(IntEnum):
-    """Mode of the planner; all six modules hold unless stated otherwise."""
+    """Mode of the planner. All six modules hold unless stated otherwise."""
 
     WAITING = 0
-    """A module's state is stale."""
+    """A module's state is missing or stale."""
     ALIGNING = 1
-    """All states fresh; commands start from the measured pose, still with `hold`."""
+    """Commands start from the measured pose, with `hold` set."""
     LEADING = 2
     """All six track."""
     OVERLOADED = 3
-    """Harness overloaded within the last `harness.overload_release_s`."""
+    """The harness is overloaded, or was within the last `harness.overload_release_s`."""
     UNCERTIFIED = 4
-    """No local gains meet the certificate in this pose."""
+    """No local gains meet the certificate."""
     MISPLACED = 5
     """Feet beyond `law.stance_max`, or just moved."""
     TRIPPED = 6
-    """Tripped (`PlannerStatus.trip`), until every value is back within its limit."""
+    """Tripped, until every value has been within its limit for 1 s."""
     MISLOADED = 7
-    """Load beyond `law.load_correction`, or not yet weighed after the hoist."""
+    """Load beyond `law.load_correction`, or not yet weighed after hanging on a hoist."""
     YIELDING = 8
-    """Another planner leads; this one sends no usable command until that one ends."""
+    """Another planner leads; this one sends no usable commands."""
     FALLEN = 9
-    """All only damp until a person re-arms them."""
+    """All modules only damp until a person re-arms them."""
 
 
 class HeatAction(IntEnum):
-    """Planner's action before a motor is too warm (docs/law.md#heat)."""
+    """Planner's action against heat (docs/law.md#heat)."""
 
     NONE = 0
     EASES = 1
-    """Assist ramps down to the weight that the wearer rests on the robot; the wearer is warned."""
+    """The assist ramps down."""
     STANDS_UP = 2
-    """Stands up on its own; the wearer cannot lead height and pitch."""
     RESTS = 3
-    """Stays straight until cooled; the wearer cannot lead height and pitch."""
+    """The robot stays straight."""
 
 
 class Park(IntEnum):
-    """Request to a robot that may park (docs/law.md#park); OPEN comes from a button."""
+    """Request about parking (docs/law.md#park)."""
 
     AUTO = 0
+    """Park a robot that stands still in a working pose."""
     NEVER = 1
     OPEN = 2
+    """Unpark, requested by a button."""
 
 
 class Wearing(IntEnum):
-    """Planner's estimate of what the wearer does (`services.planner.watch.park`)."""
+    """Wearer's action, as the planner estimates it (docs/law.md#park)."""
 
     LEADS = 0
     """The wearer leads height and pitch."""
@@ -230,9 +219,9 @@ class Wearing(IntEnum):
     AWAY = 2
     """Parked; nobody touches the harness."""
     PULLS = 3
-    """Pull along the floor; no effect."""
+    """The wearer pulls horizontally; no effect."""
     BUMPED = 4
-    """Parked; the bump was too short to open it."""
+    """A bump was too short to unpark the robot."""
 
 
 class SplitSource(IntEnum):
@@ -241,11 +230,11 @@ class SplitSource(IntEnum):
     DIAGONAL = 0
     """The paper's diag(K_q)."""
     SCHEDULE = 1
-    """Certified schedule."""
+    """The certified schedule."""
     STIFFENED = 2
-    """Stiffer than the schedule, to meet the certificate."""
+    """Stiffened to meet the certificate."""
     UNCERTIFIED = 3
-    """No gains met the certificate: all hold."""
+    """No gains meet the certificate; all modules hold."""
     CONTROLLER = 4
     """Certified gains of your own controller."""
 
@@ -265,18 +254,18 @@ class RunEventKind(IntEnum):
     """Kind of run event."""
 
     STARTED = 0
-    """Scenario started."""
+    """The scenario started."""
     KILLED = 1
     """A service received a signal."""
     RESTARTED = 2
     """A service was started or continued."""
     PUSHED = 3
     FINISHED = 4
-    """Scenario ended."""
+    """The scenario ended."""
     FAULTED = 5
-    """Drive fault began; subject: module, detail: kind."""
+    """A drive fault began; `subject` is the module, `detail` the kind."""
     STALLED = 6
-    """Machine stall ended; detail: duration."""
+    """A stall of the machine ended; `detail` is its duration."""
 
 
 def name_of(kind: type[IntEnum], code: int) -> str:
@@ -291,219 +280,207 @@ class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True,
     """Base of all messages: the sender's monotonic time and a sequence number."""
 
     t_ns: Int64
-    """Sender's monotonic time of the content."""
+    """Time of the content, on the sender's monotonic clock."""
     seq: Int64
-    """Sequence number on this key; counts up by 1."""
+    """Sender's sequence number on this key."""
 
 
 class JointState(Message, frozen=True):
-    """State of one module, published at the state rate.
-
-    The planner echoes `t_ns` in `JointCommand.echo_t_ns`.
-    """
+    """State of one module."""
 
     q: Pair
     """Joint angles (phi, theta), rad."""
     v: Pair
     """Joint rates, rad/s."""
     tau: Pair
-    """Joint torques sent to the drive, after the limiter, N m."""
+    """Joint torques after the limiter, N m."""
     mode: Int64
     cause: Int64
-    """Cause of the last mode change."""
     ready: bool
-    """True if commands have been fresh long enough to track once `hold` is lifted."""
+    """The module tracks as soon as `hold` is cleared."""
     age_ns: Int64
-    """Age of the command in use (docs/architecture.md#age-rule); -1: no command."""
+    """Age of the newest accepted command (docs/architecture.md#age-rule); -1: none."""
     session: Int64
-    """Its session; 0: no command."""
+    """Its session; 0: none."""
     command_seq: Int64
-    """Its sequence number; -1: no command."""
+    """Its sequence number; -1: none."""
     cycle: Int64
     """Cycles since the start."""
     late: Int64
-    """Cycles over two periods after the previous one."""
+    """Cycles that began over two periods after the last."""
     dropouts: Int64
-    """Recent drop-outs; they lengthen the wait before TRACK."""
+    """Recent dropouts."""
     refused: Int64
-    """Commands refused since the start (`Refusal`)."""
+    """Refused commands since the start."""
     drive: Int64
     drive_error: Int64
-    """Error bits of both axes, or-ed."""
+    """Error bits of both axes."""
     stiffened: bool = False
-    """True while gains are at, or rise to, the support gains."""
+    """Gains are at, or rise to, the support gains."""
     outside: Int64 = 0
-    """Part of the newest command that is outside the envelope (`Outside`); 0 if none is."""
+    """Violation of the envelope by the newest command."""
     state_phase: Int64 = 0
-    """Phase of its states (`JointCommand`)."""
+    """`JointCommand.state_phase` in use."""
     refusal: Int64 = 0
     """Newest refusal within the last second."""
     refused_session: Int64 = 0
     """Session of that command."""
     celsius: Pair = (0.0, 0.0)
-    """Estimated winding temperatures, C; 0: not estimated."""
+    """Estimated winding temperatures; 0: not estimated."""
     heat_left_s: float = -1.0
-    """Time at this load until a winding or output stage is too warm, s; 3600: at least an hour; -1:
-    not estimated."""
+    """Time at this load until a winding or output stage reaches its limit, at most 3600; -1: not
+    estimated."""
     supply_v: float = 0.0
-    """Drive's supply voltage, V; 0: unknown."""
+    """Supply voltage of the drive; 0: unknown."""
 
 
 class JointCommand(Message, frozen=True):
-    """References, local gains and torques for one module (docs/law.md#references-and-age)."""
+    """Command to a module (docs/law.md#references-and-age)."""
 
     session: Int64
     """Random number of this planner session."""
     echo_t_ns: Int64
-    """`t_ns` of this module's newest state; gives the age on the module's clock."""
+    """`t_ns` of this module's newest state."""
     hold: bool
-    """True requests HOLD, so that no leg works against the other."""
+    """True requests HOLD."""
     q_ref: Pair
     """Reference, rad."""
     v_ref: Pair
-    """Its rate, rad/s."""
+    """Rate of `q_ref`, rad/s."""
     tau_ff: Pair
     """Feedforward torque, N m."""
     dtau_ff: Pair
-    """Its rate, N m/s."""
+    """Rate of `tau_ff`, N m/s."""
     tau_coupled: Pair
-    """Coupled torque, N m: body stiffness and damping beyond the local gains, and the push
-    integral, low-passed; plus the eased lead. Dropped in HOLD."""
+    """Coupled torque (docs/law.md#gain-split) and eased lead, N m."""
     k_p: Pair
     """Local stiffness D, N m/rad."""
     k_d: Pair
     """Local damping D_B, N m s/rad."""
     margin: float
-    """Static certificate's margin for all six modules: 1 is the required stiffness, 0 a fall
-    (docs/law.md#certificate)."""
+    """Margin of the local gains of all six modules (docs/law.md#certificate)."""
     margin_onboard: float
-    """Same for the drives' own loops."""
+    """Margin of the drives' own loops."""
     stiffen: bool = False
-    """Another module may be limp: in HOLD, rise to the support gains."""
+    """In HOLD, rise to the support gains."""
     state_phase: Int64 = 0
-    """Period in which to send the state (docs/architecture.md#rates)."""
+    """Cycle in which to send the next state (docs/architecture.md#rates)."""
     fallen: bool = False
-    """True once fallen: drop all stiffness."""
+    """True: drop all stiffness."""
 
 
 class JointEvent(Message, frozen=True):
-    """A change of mode of a joint service."""
+    """Change of mode."""
 
     mode_before: Int64
     mode_after: Int64
     cause: Int64
     age_ns: Int64
-    """Age of the newest command; -1: no command."""
+    """Age of the newest accepted command; -1: none."""
     tau_before: Pair
-    """Torque in the last cycle before the change, N m."""
+    """Torque in the cycle before the change, N m."""
     tau_after: Pair
-    """Torque in the first cycle after it, N m."""
+    """Torque in the cycle of the change, N m."""
 
 
 class Wrench(Message, frozen=True):
-    """Wrench of the operator on the torso, at the harness point.
-
-    In torso axes, because the sensor is fixed to the torso. The assist on the operator has the
-    opposite sign.
-    """
+    """Wrench of the operator on the torso, torso axes."""
 
     force: Vector3
-    """N, torso axes."""
+    """Force, N."""
     moment: Vector3
-    """About the harness point, N m, torso axes."""
+    """Moment about the harness point, N m."""
     valid: bool
-    """False: stale, saturated, frozen or no zero; the values are the last good ones."""
+    """False: stale, saturated, frozen or not zeroed; force and moment are the last valid ones."""
     saturated: bool
-    """A sensor leg is at its limit."""
+    """A load cell is at its limit."""
     tare: Int64
     age_ns: Int64
-    """Age of the sample, harness service's clock."""
+    """Age of the sample; -1 before the first."""
 
 
 class Attitude(Message, frozen=True):
-    """Direction of up, from the IMU on the torso."""
+    """Attitude of the torso."""
 
     up: Vector3
     """Unit vector against gravity, torso axes."""
     rate: Vector3
     """Angular velocity, rad/s, torso axes."""
     valid: bool
-    """False: silent, frozen or no fix; the values are the last good ones."""
+    """False: stale, frozen or invalid; up and rate are the last valid ones."""
     age_ns: Int64
-    """Age of the sample, IMU service's clock; -1 before the first."""
+    """Age of the sample; -1 before the first."""
 
 
 class TareRequest(Message, frozen=True):
-    """Request for a new zero: the harness service makes the present wrench read zero."""
+    """Request to make the present wrench zero."""
 
     source: str
 
 
 class ToolRoster(Message, frozen=True):
-    """Tools that are linked with the recorder, and problems that it found."""
+    """Tools linked to the recorder, and faults."""
 
     tools: tuple[str, ...]
     """Each as NAME.HOST.PID."""
     trouble: tuple[str, ...] = ()
-    """Faults of recording and of the host's disk, one line each."""
+    """Faults of recording and of the host's disk."""
 
 
 class PlannerStatus(Message, frozen=True):
-    """Inputs and decisions of one planner tick."""
+    """Inputs and decisions of one tick."""
 
     session: Int64
-    """Random number of this planner session."""
+    """As in `JointCommand`."""
     mode: Int64
     hold: bool
-    """True if the commands request HOLD."""
+    """The commands request HOLD."""
     p: Vector6
     """Measured pose: COM x y z, m; torso roll, pitch, yaw, rad; world."""
     pdot: Vector6
-    """Its rate."""
+    """Rate of `p`."""
     p_ref: Vector6
-    """Its reference."""
+    """Reference of `p`."""
     closure: Vector6
     """Left minus right leg's estimate of the torso pose, m and rad, world."""
     assist_n: float
-    """Assist in the feedforward, N."""
+    """Assist in the feedforward, plus the lift that stands the robot up."""
     margin: float
-    """As in the commands; 0 before the first tick."""
+    """As in `JointCommand`; 0 before the first tick."""
     margin_onboard: float
-    """Same for the drives' own loops."""
+    """As in `JointCommand`."""
     split: Int64
     ik_iterations: Int64
-    """Inverse kinematics steps."""
+    """Steps of the inverse kinematics."""
     ik_residual: float
-    """Largest residual, m or rad."""
+    """Its largest residual, m or rad."""
     tick_us: float
-    """Tick duration, from reading inputs to sending the last command."""
+    """Duration of the tick."""
     state_seq: Modules
-    """Sequence number of each module's state used."""
+    """Sequence number of each module's state; -1: none."""
     wrench_seq: Int64
-    """Sequence number of the wrench used; -1: none yet."""
+    """Sequence number of the newest wrench; -1: none."""
     assist_requested_n: float
-    """Operator's request, N."""
+    """Operator's request."""
     state_age_ns: Modules
-    """Time since each module's newest state arrived; -1: none yet."""
+    """Time since each module's newest state arrived; -1: none."""
     wait_s: float = 0.0
-    """Remaining wait after drop-outs, s."""
+    """Remaining wait after dropouts."""
     attitude_seq: Int64 = -1
-    """Sequence number of the attitude used; -1: none yet."""
+    """Sequence number of the newest attitude; -1: none."""
     slope: Pair = (0.0, 0.0)
-    """Floor slope along x and y, rad."""
+    """Slope of the floor along x and y, rad."""
     shift_requested: Vector4 = STRAIGHT
-    """Requested shift: x, y, m; roll, yaw, rad."""
+    """`OperatorIntent.shift` in use."""
     stance: Vector6 = AS_CONFIGURED
-    """Right foot relative to the left, as deviation from the robot file: x, y, z, m; rotation
-    vector, rad, world."""
+    """Stance: x, y, z, m; rotation vector, rad; world."""
     why: str = ""
-    """Why it does not lead, beyond the mode; a supply fault comes first."""
+    """Warnings about supply, harness and heat, and why the planner does not lead."""
     trip: Int64 = 0
     load: Vector3 = (0.0, 0.0, 0.0)
-    """Load beyond the robot file: kg; moments a and b about pitch, N m
-    (`services.planner.law.load`)."""
+    """Load beyond the robot file, kg; its moments, N m (`services.planner.law.load`)."""
     requested_by: str = ""
-    """Source of the intent in use; empty: none or stale."""
+    """Source of the intent in use; empty: none."""
     refused: Int64 = 0
     """Implausible states, wrenches and attitudes so far."""
     sit: bool = False
@@ -512,21 +489,21 @@ class PlannerStatus(Message, frozen=True):
     heat_left_s: float = -1.0
     """Smallest `heat_left_s` of the modules."""
     supply_v: float = 0.0
-    """Lowest drive supply, V, low-passed; 0: unknown."""
+    """Lowest supply voltage, low-passed; 0: unknown."""
     carried_n: float = 0.0
-    """Payload and person carried, N (docs/law.md#wearer); without a harness, the payload."""
+    """Payload and person carried (docs/law.md#wearer); without a harness, the payload."""
     wearer: Int64 = 0
-    """0 if the robot may not park."""
+    """`LEADS` also if `park.enabled` is false."""
     park_requested: Int64 = 0
 
 
 class OperatorIntent(Message, frozen=True):
-    """Person's requests beyond leading by hand."""
+    """Requests besides leading by hand."""
 
     assist_n: float
-    """Requested upward force at the harness, N."""
+    """Requested upward force at the harness."""
     shift: Vector4 = STRAIGHT
-    """Offset from a straight stand: COM x and y, m; torso roll and yaw, rad."""
+    """Shift: COM x and y, m; torso roll and yaw, rad."""
     source: str = ""
     sit: bool = False
     """Go down to the lowest pose and hold there (`xrl down`)."""
@@ -534,10 +511,10 @@ class OperatorIntent(Message, frozen=True):
 
 
 class HandLead(Message, frozen=True):
-    """Lead and push of a person in place of the scenario's simulated hand."""
+    """Lead and push that replace the scenario's."""
 
     leads: bool
-    """False: only the push counts."""
+    """False: only `push` counts."""
     height: float
     """Torso origin above the ankles, m."""
     pitch: float
@@ -548,25 +525,24 @@ class HandLead(Message, frozen=True):
 
 
 class Estop(Message, frozen=True):
-    """Emergency stop: every module goes to DAMP; only a restart leaves it."""
+    """Every module goes to DAMP until it restarts."""
 
     source: str
 
 
 class SimControl(Message, frozen=True):
-    """Command of a tool to the simulated world."""
+    """Command to start the scenario."""
 
     start: bool
-    """Start the scenario at time 0."""
 
 
 class RunEvent(Message, frozen=True):
-    """An action of a tool on the run, for the log and the verdict."""
+    """Event of a run."""
 
     kind: Int64
     subject: str
-    """Service or push."""
+    """Service, module or other object."""
     detail: str
-    """Signal, or push in words."""
+    """Signal, push, fault or duration; or empty."""
     scenario_s: float
-    """Scenario time, s."""
+    """Scenario time."""

@@ -1,7 +1,7 @@
-"""Inboxes and outboxes of a service's loop, wherever it runs.
+"""Inboxes and outboxes of a service's loop.
 
-Live they are `Latest` and `Publisher` of `shared.bus.session`, in lockstep modelled links, in
-re-execution the log's messages.
+In live operation they are `Latest` and `Publisher` of `shared.bus.pubsub`. In lockstep they are
+modelled links, and in re-execution the log's messages.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class CountingInbox(Inbox[M_co], Protocol[M_co]):
 
     @property
     def refused(self) -> int:
-        """Payloads so far that were not messages."""
+        """Number of payloads so far that were not messages."""
 
 
 class Outbox(Protocol[M_contra]):
-    """Messages of one key."""
+    """Sender of one key's messages."""
 
     def put(self, message: M_contra, /) -> bool:
         """Send without waiting; return False if it could not be sent."""

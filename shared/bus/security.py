@@ -1,14 +1,14 @@
-"""Access to the bus, and what each peer may put and receive there (docs/security.md).
+"""Access to the bus, and the messages that each peer may put and receive (docs/security.md).
 
-Zenoh's settings for each `bus.security.mode`, and what `mtls` adds. Each process checks what its
-peers send by the name in their certificate: service and generation. The rules follow from the
+Zenoh's settings follow from `bus.security.mode`. Under `mtls` each process checks the messages of
+its peers by the name in their certificate: service and generation. The rules follow from the
 topics' columns `writers` and `readers`; everything else is denied. Zenoh has no list of revoked
 certificates, so the rules contain only the current generation of each name.
 
-Services of one host are linked by UNIX sockets. A TLS listener of Zenoh reports ten failed
-handshakes a second and keeps the sockets of all others until then, so anyone who reaches its port
-can block new links. Only this user can open a socket in the run directory. A peer on it may do what
-any of the keys here allows, because its user can read them.
+Services of one host are linked by UNIX sockets, because anyone who reaches a TLS port can block new
+links there (`shared.bus.sockets`). Only this user can open a socket in the live directory. A peer
+on such a socket has the rights of all certificates on this host, because its user can read their
+keys.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ UNIX: Final = "unixsock-stream/"
 TCP: Final = ("tcp/", "tls/")
 
 MESSAGE_MAX: Final = 1 << 20
-"""Maximum message that is assembled from its fragments, bytes."""
+"""Maximum size of a message assembled from fragments, bytes."""
 PAYLOAD_MAX: Final = 1 << 16
-"""Maximum accepted payload, bytes; the largest of the topics is a third of it."""
+"""Maximum accepted payload, bytes; the largest payload of any topic is a third of this."""
 HANDSHAKE_MS: Final = 2_000
 """Timeout of a TLS handshake at a listener; Zenoh's own is 10 s."""
 SESSIONS_MAX: Final = 128
-"""Maximum number of peers, all names together; hung viewers must not shut a planner out."""
+"""Maximum number of peers in total; hung viewers must not lock out a planner."""
 
 _LOW_PASS: Final[dict[str, Any]] = {
     "id": "payloads",
@@ -45,7 +45,7 @@ _LOW_PASS: Final[dict[str, Any]] = {
 }
 _SOCKET: Final = "unixsock-stream/{{run}}/{service}.zenoh"
 _ANY_PORT: Final = 9
-"""Nothing is sent there."""
+"""Port for looking up a route; nothing is sent to it."""
 _THIS_HOST: Final = "this-host"
 _RECEIVED: Final = ("declare_subscriber",)
 _TOKENS: Final = ("liveliness_token",)
@@ -53,10 +53,10 @@ _QUERIES: Final = ("liveliness_query", "declare_liveliness_subscriber")
 
 
 def settings(robot: RobotConfig, process: str, endpoints: Sequence[str]) -> dict[str, object]:
-    """Return Zenoh's access settings.
+    """Return Zenoh's access settings for a process.
 
-    `endpoints` are all that the process listens on or dials, as Zenoh takes them. Raises BusError
-    if an endpoint does not fit the mode, or a key is missing.
+    `endpoints` are all endpoints that the process listens on or dials, in Zenoh's form. Raises
+    BusError if an endpoint does not fit the mode, or a key is missing.
     """
     mode = robot.bus.security.mode
     right_ones = ENDPOINTS_OF_MODE[mode] + ((UNIX,) if mode == "mtls" else ())
@@ -114,10 +114,10 @@ def limit_queues(robot: RobotConfig, listening: Sequence[str]) -> None:
 def access_control(
     robot: str, own: str, generations: Mapping[str, int], held: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return Zenoh's setting `access_control` of one process, one of `PRINCIPALS`.
+    """Return Zenoh's setting `access_control` for a process whose name `own` is in `PRINCIPALS`.
 
-    `generations` are the current ones of each certified name; `held` are the names whose keys this
-    host holds, which its UNIX sockets serve.
+    `generations` are the current generations of all certified names; `held` are the names whose
+    keys this host has, and which its UNIX sockets therefore admit.
     """
     shown = (f"{alive_prefix(robot)}/*", f"{tools_prefix(robot)}/*")
     rules = [
@@ -201,10 +201,10 @@ def _token_keys(robot: str, name: str) -> tuple[str, ...]:
 
 
 def services_here(robot: RobotConfig) -> frozenset[str]:
-    """Return the services of this host: it holds their keys, and their address is its own.
+    """Return the services of this host: those whose keys it has and whose address is its own.
 
-    Empty unless the bus is `mtls` and this host has keys. A name lookup may block: call it at the
-    start only.
+    Empty unless `bus.security.mode` is `mtls` and this host has keys. A name lookup may block, so
+    call this only at start-up.
     """
     if robot.bus.security.mode != "mtls":
         return frozenset()
@@ -216,15 +216,18 @@ def services_here(robot: RobotConfig) -> frozenset[str]:
 
 
 def endpoint_here(robot: RobotConfig, service: str, here: frozenset[str]) -> str:
-    """Return a service's endpoint for a process of this host, with these `services_here`."""
+    """Return a service's endpoint for a process of this host; `here` is from `services_here`."""
     return _SOCKET.format(service=service) if service in here else robot.bus.endpoints[service]
 
 
 def listening(robot: RobotConfig, service: str, here: frozenset[str]) -> tuple[str, ...]:
-    """Return the endpoints of a service here; with a port only if another host may link to it."""
+    """Return the endpoints on which a service of this host listens.
+
+    A service with a UNIX socket also listens on its TLS port if another host may link to it.
+    """
     own = endpoint_here(robot, service, here)
     public = robot.bus.endpoints[service]
-    # The simulator runs where the fleet starts it; a real robot's hosts have no key for it.
+    # A fleet starts its own simulator; the hosts of a real robot have no key for it.
     others = set(robot.services) - here - {"simulator"}
     return (own, public) if own != public and (others or robot.bus.security.allow) else (own,)
 

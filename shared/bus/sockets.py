@@ -1,9 +1,9 @@
 """TCP sockets of this process and host, from the kernel (Linux): Zenoh does not expose its own.
 
-A TLS listener of Zenoh sleeps for 100 ms after each failed handshake. It also accepts all
-connections that wait meanwhile, each with a descriptor: 640 bad connections a second left 4700 open
-in a minute. With a queue of one it accepts no more than it ends. The firewall decides which
-addresses reach the ports at all (`deploy/nftables`).
+A TLS listener of Zenoh sleeps for 100 ms after each failed handshake. It then accepts all
+connections that arrived meanwhile, each with a descriptor: 640 bad connections a second left 4700
+open in a minute. With a queue of one it accepts only as many as it closes. The firewall decides
+which addresses reach the ports (`deploy/nftables`).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def shorten_queues(ports: Collection[int]) -> None:
 
 
 def reset_on_close(local: Address, remote: Address) -> bool:
-    """Make the TCP connection between two addresses close by a reset; False if not found.
+    """Make a TCP connection close with a reset; return False if it is not found.
 
     With a linger time, `close` blocks its thread until the other side has received everything or
-    the time is over. Without it, the kernel keeps sending to a host that is cut off, and after the
-    TLS link was dialled again the robot was not led within 30 s. A reset drops unsent data, which
-    is older than what the next link carries.
+    the time is over. Without one, the kernel keeps sending to a host that is cut off, and after the
+    TLS link was dialled again the planner did not lead within 30 s. A reset drops the unsent data,
+    which is older than the data on the next link.
     """
     for own in _own_sockets():
         with contextlib.suppress(OSError):  # not connected
@@ -85,7 +85,7 @@ def _waiting_max() -> int:
     return 0 if _SYN_COOKIES.exists() and _SYN_COOKIES.read_text().strip() != "0" else 1
 
 
-# ---- connections of this host, as /proc/net has them
+# ---- connections of this host, from /proc/net
 
 _PROC_NET: Final = Path("/proc/net")
 _TCP: Final = ("tcp", "tcp6")
@@ -96,7 +96,7 @@ _ESTABLISHED: Final = re.compile(
 
 
 def established(inodes: Collection[int], proc_net: Path = _PROC_NET) -> set[Address]:
-    """Return the remote ends, numeric address and port, of TCP connections by their inodes."""
+    """Return the remote addresses and ports of the TCP connections with these socket inodes."""
     return {
         (str(_address(address)), int(port, 16))
         for address, port, inode in _ESTABLISHED.findall(_tables(proc_net, *_TCP))

@@ -34,9 +34,9 @@ _VERDICTS: Final = {
 
 
 def own_fault(own: Credentials) -> str:
-    """Return the fault of a certificate by this host's clock and authority; "" if valid.
+    """Return the fault of a certificate, judged by this host's clock and authority; "" if valid.
 
-    Uses a handshake in memory: no link, and no library beside Python's.
+    The handshake is in memory, so it needs no link and no library except Python's.
     """
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
@@ -60,7 +60,7 @@ def own_fault(own: Credentials) -> str:
 
 
 def refusal(own: Credentials, endpoint: str) -> str:
-    """Return why a link to tls/HOST:PORT fails, in words; empty if TLS accepts it.
+    """Return why a link to tls/HOST:PORT fails, in words; "" if it does not.
 
     Takes up to 1.3 s; not for a control loop.
     """

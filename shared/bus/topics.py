@@ -13,7 +13,7 @@ from shared.joints import MODULES
 
 
 class Priority(IntEnum):
-    """Bus priority of a topic; control goes first."""
+    """Bus priority of a topic."""
 
     REAL_TIME = 1
     DATA = 5
@@ -23,12 +23,12 @@ class Priority(IntEnum):
 _REAL_TIME, _DATA, _BACKGROUND = Priority
 
 OPERATOR: Final = "operator"
-"""Name of a tool that may act: `xrl estop`, `xrl demo`, ..."""
+"""Name of a tool that may write: `xrl estop`, `xrl demo`, ..."""
 VIEWER: Final = "viewer"
 """Name of a tool that only reads."""
 RECORDER: Final = "recorder"
 HOST_RECORDER: Final = "host_recorder"
-"""Recorder of one host: on the bus a tool, which listens nowhere."""
+"""Name of the recorder of one host. On the bus it is a tool: it has no endpoint."""
 READERS_OF_ALL: Final = (RECORDER, OPERATOR, VIEWER)
 PRINCIPALS: Final = (*SERVICES, OPERATOR, VIEWER)
 """Every name that a certificate can have under `mtls`; the network proxy has no certificate."""
@@ -46,13 +46,13 @@ class Topic(msgspec.Struct, frozen=True):
     writers: tuple[str, ...]
     """Allowed senders: services, `operator`, or `*`, the module in the key (docs/security.md)."""
     readers: tuple[str, ...]
-    """Services that use it; `READERS_OF_ALL` may read every topic."""
+    """Services that read it; `READERS_OF_ALL` may also read it."""
     why: str
     recorded: bool = True
     batch: Topic | None = None
-    """Topic whose batches carry it to the recorder (`Batch`); None: its own key does."""
+    """Topic of the batches (`Batch`) that also carry it to the recorder; None: not batched."""
     closes: bool = False
-    """True if this message completes the batch."""
+    """True if a message of this topic completes the batch."""
 
     def key(self, robot: str, module: str = "") -> str:
         """Return the full key, for example `xrl/lab/joint/ankle_right/state`."""
@@ -66,40 +66,40 @@ class Topic(msgspec.Struct, frozen=True):
 
 JOINT_BATCH: Final = Topic(
     "joint/*/batch", traces.Batch, 50.0, _DATA, ("*",), (),
-    "states, events and traces of a module, for the recorder", recorded=False,
+    "states, events and traces, for the recorder", recorded=False,
 )  # fmt: skip
 PLANNER_BATCH: Final = Topic(
     "planner/batch", traces.Batch, 250.0, _DATA, ("planner",), (),
-    "commands and status of each tick, and checkpoints, for the recorder", recorded=False,
+    "commands, status and checkpoints, for the recorder", recorded=False,
 )  # fmt: skip
 JOINT_STATE: Final = Topic(
     "joint/*/state", messages.JointState, 250.0, _REAL_TIME, ("*",), ("planner",),
-    "input of the planner, which echoes the timestamp", batch=JOINT_BATCH,
+    "measured state", batch=JOINT_BATCH,
 )  # fmt: skip
 JOINT_COMMAND: Final = Topic(
     "joint/*/command", messages.JointCommand, 250.0, _REAL_TIME, ("planner",), ("*",),
-    "references, gains and torques of the law", batch=PLANNER_BATCH,
+    "references, gains and torques", batch=PLANNER_BATCH,
 )  # fmt: skip
 JOINT_EVENT: Final = Topic(
     "joint/*/event", messages.JointEvent, 0.0, _DATA, ("*",), (),
-    "every change of state, with its cause and torque step", batch=JOINT_BATCH, closes=True,
+    "change of mode", batch=JOINT_BATCH, closes=True,
 )  # fmt: skip
 JOINT_TRACE: Final = Topic(
     "joint/*/trace", traces.JointTrace, 50.0, _BACKGROUND, ("*",), (),
-    "inputs of every cycle, from which a joint service is re-executed bit for bit",
+    "inputs of every cycle, for re-execution",
     batch=JOINT_BATCH, closes=True,
 )  # fmt: skip
 WRENCH: Final = Topic(
     "harness/wrench", messages.Wrench, 250.0, _DATA, ("harness",), ("planner",),
-    "wrench that the operator applies to the torso",
+    "wrench on the torso",
 )  # fmt: skip
 ATTITUDE: Final = Topic(
     "imu/attitude", messages.Attitude, 100.0, _DATA, ("imu",), ("planner",),
-    "direction of up, if an IMU is fitted",
+    "attitude, if an IMU is fitted",
 )  # fmt: skip
 HARNESS_TARE: Final = Topic(
     "harness/tare", messages.TareRequest, 0.0, _DATA, (OPERATOR,), ("harness",),
-    "request to zero the harness sensor",
+    "zeroing of the harness sensor",
 )  # fmt: skip
 PLANNER_STATUS: Final = Topic(
     "planner/status", messages.PlannerStatus, 250.0, _DATA, ("planner",), (),
@@ -107,32 +107,32 @@ PLANNER_STATUS: Final = Topic(
 )  # fmt: skip
 PLANNER_CHECKPOINT: Final = Topic(
     "planner/checkpoint", traces.PlannerCheckpoint, 1.0, _BACKGROUND, ("planner",), (),
-    "the planner's state, from which re-execution can start; more frequent at start-up",
+    "planner state, for re-execution; at start-up more often",
     batch=PLANNER_BATCH,
 )  # fmt: skip
 OPERATOR_INTENT: Final = Topic(
     "operator/intent", messages.OperatorIntent, 50.0, _DATA, (OPERATOR, "simulator"),
-    ("planner", "simulator"), "assist and shift that the person requests",
+    ("planner", "simulator"), "requests of the person",
 )  # fmt: skip
 OPERATOR_HAND: Final = Topic(
     "operator/hand", messages.HandLead, 0.0, _DATA, (OPERATOR,), ("simulator",),
-    "leads and pushes the simulated robot by hand; no service of a real robot reads it",
+    "hand and push on the simulated robot",
 )  # fmt: skip
 ESTOP: Final = Topic(
     "estop", messages.Estop, 0.0, _REAL_TIME, (OPERATOR,), MODULES,
-    "emergency stop: every module goes to DAMP",
+    "emergency stop",
 )  # fmt: skip
 SIM_TRUTH: Final = Topic(
     "sim/truth", traces.SimTruth, 100.0, _BACKGROUND, ("simulator",), (),
-    "true state of the world, for the verdict; no controller reads it",
+    "true state, for the verdict",
 )  # fmt: skip
 SIM_STATE: Final = Topic(
     "sim/state", traces.SimState, 10.0, _BACKGROUND, ("simulator",), (),
-    "complete state of the simulated world, from which `xrl log whatif` continues",
+    "complete state, for `xrl log whatif`",
 )  # fmt: skip
 SIM_CONTROL: Final = Topic(
     "sim/control", messages.SimControl, 0.0, _DATA, (OPERATOR,), ("simulator",),
-    "starts the scenario",
+    "start of the scenario",
 )  # fmt: skip
 RUN_EVENT: Final = Topic(
     "run/event", messages.RunEvent, 0.0, _DATA, (OPERATOR,), (),
@@ -140,11 +140,11 @@ RUN_EVENT: Final = Topic(
 )  # fmt: skip
 LINK_EVENT: Final = Topic(
     "link/event", traces.LinkEvent, 0.0, _DATA, ("network_proxy",), (),
-    "deliberate impairments of the network; a log without them is not evidence",
+    "deliberate network impairments",
 )  # fmt: skip
 TOOLS: Final = Topic(
     "recorder/tools", messages.ToolRoster, 2.0, _BACKGROUND, (RECORDER,), (),
-    "which tools watch or lead, and when",
+    "linked tools, and recording faults",
 )  # fmt: skip
 
 TOPICS: Final = tuple(row for row in tuple(globals().values()) if isinstance(row, Topic))
@@ -166,7 +166,7 @@ def keys(topic: Topic, robot: str) -> tuple[str, ...]:
 
 
 def keys_by_batch(robot: str) -> dict[str, set[str]]:
-    """Return, by full key of a batch, the full keys that the batch may contain."""
+    """Return the full keys that each batch may contain, by the batch's full key."""
     found: dict[str, set[str]] = {}
     for topic in TOPICS:
         if topic.batch is not None:
@@ -177,12 +177,12 @@ def keys_by_batch(robot: str) -> dict[str, set[str]]:
 
 
 def all_keys(robot: str) -> dict[str, Topic]:
-    """Return the topic of every full key of a robot."""
+    """Return the topic of each full key of a robot."""
     return {key: topic for topic in TOPICS for key in keys(topic, robot)}
 
 
 def recorded_keys(robot: str) -> dict[str, Topic]:
-    """Return the topic of every full key of a robot that the recorder writes."""
+    """Return the topic of each recorded full key of a robot."""
     return {key: topic for key, topic in all_keys(robot).items() if topic.recorded}
 
 
@@ -199,7 +199,7 @@ def read_keys(robot: str, name: str) -> tuple[str, ...]:
 
 
 def keys_between(robot: str, writer: str, reader: str) -> tuple[str, ...]:
-    """Return the full keys that the writer may put and the reader may receive."""
+    """Return the full keys that `writer` may put and `reader` may receive."""
     written = written_keys(robot, writer)
     if reader in READERS_OF_ALL:
         return written

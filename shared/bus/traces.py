@@ -1,6 +1,6 @@
-"""Messages for the log: service inputs, the true world, and network impairments.
+"""Messages for the log: inputs of services, the simulated world, and network impairments.
 
-Re-execution reads them. They are on the bus like all others; only the recorder subscribes.
+Of the services, only the recorder subscribes to them. Re-execution reads the inputs from the log.
 """
 
 from __future__ import annotations
@@ -11,66 +11,67 @@ from shared.bus.messages import Int64, Message, Pair, Vector3
 
 
 class CycleTrace(msgspec.Struct, gc=False, frozen=True):
-    """Inputs and decision of one cycle of a joint service."""
+    """Inputs and decision of one cycle."""
 
     now_ns: Int64
     sampled_ns: Int64
-    """Arrival of the drive's sample; -1: no sample, the next six fields are void."""
+    """Arrival of the drive's sample; -1: none, and the next six fields are invalid."""
     pos: Pair
     """Motor positions from the joint's zero, turns."""
     vel: Pair
     """Motor rates, turn/s."""
     status: Int64
+    """`DriveStatus`."""
     error: Int64
-    """Drive's error bits."""
+    """Error bits of the drive."""
     carried: Pair
-    """Motor torques of a drive found armed, N m."""
+    """Motor torques of a drive that was found armed, N m."""
     carries: bool
     """`carried` is valid."""
     session: Int64
-    """Session of this cycle's command."""
+    """Session of this cycle's command; 0: no command."""
     command_seq: Int64
     """Its sequence number; -1: no command."""
     estop: bool
-    """Emergency stop engaged."""
+    """The emergency stop is engaged."""
     drive_command: Int64
-    """Command to the drive: 0 nothing, 1 torques, 2 a target, 3 idle, 4 arm, 5 forget the zero,
-    6 clear errors."""
+    """Command to the drive: 0 none, 1 torques, 2 target, 3 idle, 4 arm, 5 clear the zero, 6 clear
+    errors."""
     tau: Pair
     """Joint torques after the limiter, N m."""
     below: Pair = (0.0, 0.0)
-    """Theta and rate of its leg, rad, rad/s: ankle plus knee for a hip, the knee for an ankle."""
+    """Theta and rate of ankle plus knee (for a hip) or knee (for an ankle), rad, rad/s."""
     knows_below: bool = False
     """`below` is valid."""
     sinks: bool = True
-    """No neighbour keeps this knee from sinking."""
+    """False: this knee must not sink."""
     stiffen: bool = False
-    """Stiffens for a limp module."""
+    """This module must stiffen: another is limp."""
     malformed: Int64 = 0
-    """Payloads of this cycle that were not commands."""
+    """Malformed payloads."""
     encoder_zero: Pair = (-1.0, -1.0)
-    """Where the encoders read 0, turns modulo one; -1: no answer in this cycle."""
+    """Positions at which the encoders read 0, turns modulo one; -1: not reported."""
     fet_celsius: Pair = (0.0, 0.0)
-    """Reported output stages, C; 0: not in this sample."""
+    """Output stages' temperatures; 0: not reported."""
     motor_celsius: Pair = (0.0, 0.0)
-    """Reported motors, C; 0: not in this sample."""
+    """Motors' temperatures; 0: not reported."""
     supply_v: float = 0.0
-    """Drive's supply voltage, V; 0: unknown."""
+    """As in `JointState`."""
     ended: Int64 = 0
-    """Session of a planner process that ended on this host; 0: none."""
+    """Session of a planner that ended on this host; 0: none."""
 
 
 class JointTrace(Message, frozen=True):
-    """Consecutive cycles of a joint service, complete enough to re-execute them."""
+    """Consecutive cycles of a joint service."""
 
     snapshot: str
-    """At intervals, the state before these cycles, as JSON; else empty."""
+    """State before these cycles, as JSON; empty in most messages."""
     cycles: tuple[CycleTrace, ...]
     """Oldest first."""
 
 
 class PlannerCheckpoint(Message, frozen=True):
-    """State of the planner before a tick, from which re-execution can start."""
+    """State of the planner after a tick."""
 
     session: Int64
     snapshot: str
@@ -78,76 +79,73 @@ class PlannerCheckpoint(Message, frozen=True):
 
 
 class SimTruth(Message, frozen=True):
-    """True state of the simulated world; no controller reads it."""
+    """True state, world axes."""
 
     scenario_s: float
-    """Scenario time; negative until the scenario starts."""
+    """Scenario time; negative before its start."""
     com: Vector3
-    """COM, m, world."""
+    """COM, m."""
     torso: Vector3
-    """Torso origin, m, world."""
+    """Torso origin, m."""
     angles: Vector3
     """Torso roll, pitch, yaw (3-1-2), rad."""
     operator_force: Vector3
-    """Force of the hand on the torso, N, world."""
+    """Force of the hand on the torso, N."""
     operator_moment: Vector3
     """Its moment, N m."""
     load_n: float
     """Weight on the harness, N."""
     harness_force_z: float
-    """Upward force on the operator, N: load minus the hand's lift."""
+    """Upward force on the operator, N: `load_n` minus the hand's lift."""
     push: Vector3
-    """Push on the torso, N, world."""
+    """Push on the torso, N."""
     foot_right_tilt: float
     """Angle between sole and floor, rad."""
     foot_left_tilt: float
-    """rad"""
     feet_slip: float
-    """Largest distance of an ankle from its start, m."""
+    """Larger distance of an ankle from its initial position, m."""
     hoist: float
-    """Hoist's support: 1 hanging, 0 free."""
+    """Support by the hoist: 1 hanging, 0 free."""
     fallen: bool
     real_time_factor: float
-    """Simulated over wall time."""
+    """Simulated time divided by wall time."""
     late_s: float
-    """World time skipped on a slow machine, s."""
+    """Clock time that the simulation has skipped."""
     lean: Pair = (0.0, 0.0)
-    """Lean of up against the floor's normal along x and y, m/m."""
+    """Slope of the vertical against the floor's normal along x and y, m/m."""
     foot_right_force: Vector3 = (0.0, 0.0, 0.0)
-    """Force of the floor on the right sole, N, world."""
+    """Force of the floor on the sole, N."""
     foot_left_force: Vector3 = (0.0, 0.0, 0.0)
-    """N"""
     foot_right_cop: Pair = (0.0, 0.0)
-    """Centre of pressure, x and y, m, world; (0, 0): no load."""
+    """Centre of pressure, x and y, m; (0, 0): no load."""
     foot_left_cop: Pair = (0.0, 0.0)
-    """m"""
     feet: Pair = (0.0, 0.0)
-    """Displacement of the ankles' midpoint since the start, x and y, m, world."""
+    """The ankles' mean displacement, x and y, m."""
 
     @property
     def over(self) -> Pair:
-        """COM along gravity on the floor, x and y, m, world, from the midpoint of the ankles."""
+        """Vertical projection of the COM, x and y, m, world, from the midpoint of the ankles."""
         x, y, z = self.com
         return x - self.feet[0] - self.lean[0] * z, y - self.feet[1] - self.lean[1] * z
 
 
 class SimState(Message, frozen=True):
-    """Complete state of the simulated world and its drives, from which a run can continue."""
+    """State of the simulated world and its drives."""
 
     scenario_s: float
-    """Negative until the scenario starts."""
+    """Scenario time."""
     qpos: tuple[float, ...]
-    """MuJoCo's qpos: m, quaternion, rad."""
+    """MuJoCo's qpos."""
     qvel: tuple[float, ...]
-    """MuJoCo's qvel: m/s, rad/s."""
+    """MuJoCo's qvel."""
     warmstart: tuple[float, ...]
     """MuJoCo's qacc_warmstart."""
     hoist: float
-    """Hoist's support: 1 hanging, 0 free."""
+    """As in `SimTruth`."""
     armed: tuple[Int64, ...]
-    """1 for each axis in closed loop; 12 values, as in the next fields."""
+    """1: in closed loop; one value per motor, as in the next fields."""
     input_pos: tuple[float, ...]
-    """Position targets, turns, drive's count."""
+    """Position targets in the drive's count, turns."""
     input_vel: tuple[float, ...]
     """Velocity targets, turn/s."""
     input_torque: tuple[float, ...]
@@ -157,33 +155,33 @@ class SimState(Message, frozen=True):
     vel_gain: tuple[float, ...]
     """Velocity gains, N m s/turn."""
     counts_from: tuple[float, ...]
-    """Encoder count at the true zero."""
+    """Count of each drive at the true zero, a whole number."""
     hidden: tuple[float, ...]
     """`World.hidden`: the person, the rotors and delayed torques."""
     hand: tuple[float, ...] = (0.0,) * 11
-    """Fields of `LedHand`; all zero: the scenario leads."""
+    """Fields of `LedHand`."""
     heat: tuple[float, ...] = ()
-    """Windings, housings and output stages, C, 12 each; empty: unknown."""
+    """Temperatures of windings, housings and output stages, C."""
 
 
 class Batch(Message, frozen=True):
-    """Messages of one service for the recorder, which wakes once for all of them."""
+    """Messages of one service, sent together."""
 
     messages: tuple[tuple[str, msgspec.Raw], ...]
     """Full key and payload of each, in the order sent."""
 
 
 class LinkEvent(Message, frozen=True):
-    """Change of the impairment of one direction of a link."""
+    """Start or end of an impairment on one direction of a link."""
 
     link: str
-    """Direction, as named in `shared.links`."""
+    """Direction, as in `shared.links`."""
     requested: str
-    """Link as requested: direction or group."""
+    """Requested direction or group."""
     number: Int64
-    """Number of the impairment, the same in all its events."""
+    """The impairment's number."""
     active: bool
-    """True from the begin, unless another hides it; False at its end."""
+    """False at the end."""
     delay_ms: float
     jitter_ms: float
     loss: float
@@ -191,8 +189,8 @@ class LinkEvent(Message, frozen=True):
     partition: bool
     """Nothing passes."""
     detail: str
-    """In the words of `--inject`."""
+    """Impairment, as `--inject` writes it."""
     passed: Int64
-    """Messages (live: Zenoh batches) that passed; 0 at the begin."""
+    """Passed messages (live: Zenoh batches); 0 at the start."""
     lost: Int64
-    """Messages lost to it."""
+    """Lost messages."""

@@ -29,18 +29,19 @@ class CanSensor(Generic[S]):
     def __init__(
         self, interface: str, channel: str, assembler: FrameGroup[S], *, pause_ns: int
     ) -> None:
-        """Prepare; the first `newest` opens the link.
+        """Store the settings; the first `newest` opens the link.
 
-        If more than `pause_ns` passes between two reads, the frames that waited on the link have an
-        unknown age (this process was stopped, and a full queue keeps the oldest frames) and are
-        discarded. Raises ConfigError if python-can does not know the interface.
+        If more than `pause_ns` passes between two reads, because this process was stopped, the
+        waiting frames are discarded: a full queue keeps its oldest frames, so their age is unknown.
+        Raises ConfigError if python-can does not know the interface.
         """
         if interface not in can.VALID_INTERFACES:
             raise _unusable(interface, "python-can does not know this interface")
         self.opened = 0
-        """Times the link was opened."""
+        """Number of times the link was opened."""
         self.discarded = 0
-        """Reads discarded for their unknown age: after a pause, or with a queue too long."""
+        """Number of reads discarded because the frames' age was unknown: after a pause, or because
+        the queue was not emptied."""
         self._interface = interface
         self._channel = channel
         self._pause_ns = pause_ns
@@ -57,11 +58,11 @@ class CanSensor(Generic[S]):
 
     @property
     def malformed(self) -> int:
-        """Sensor frames of a wrong length or out of order."""
+        """Number of sensor frames of a wrong length or out of order."""
         return self._assembler.malformed
 
     def newest(self, now_ns: int) -> S | None:
-        """Return the newest sample that came since the last call, or None; never blocks.
+        """Return the newest sample that arrived since the last call, or None; never blocks.
 
         Never raises for a lost link; returns None until it is back.
         """
@@ -83,7 +84,7 @@ class CanSensor(Generic[S]):
     def close(self) -> None:
         """Release the link; a later `newest` would open it again."""
         if self._bus is not None:
-            # The link may be the very thing that is broken.
+            # The link itself may be broken.
             with contextlib.suppress(can.CanError, OSError):
                 self._bus.shutdown()
         self._bus = None
@@ -130,7 +131,7 @@ def sensor_of(
 ) -> CanSensor[S]:
     """Return a sensor on the bus that its section of the robot file names."""
     link = robot.can[section.bus]
-    # at a low rate every read comes later than `stale_ms`: two periods are no pause
+    # at a low rate reads are more than `stale_ms` apart: up to two periods are not a pause
     pause_ns = round(max(section.stale_ms * NS_PER_MS, 2.0 * NS_PER_S / section.rate_hz))
     return CanSensor(link.interface, expand(link.channel, run_dir), assembler, pause_ns=pause_ns)
 

@@ -56,7 +56,7 @@ class Command(IntEnum):
 
 
 class AxisState(IntEnum):
-    """`axis.current_state` and `axis.requested_state`; from 14 on firmware 0.6 only."""
+    """`axis.current_state` and `axis.requested_state`; 14 and above: firmware 0.6 only."""
 
     UNDEFINED = 0
     IDLE = 1
@@ -103,8 +103,8 @@ class InputMode(IntEnum):
 class AxisError(IntFlag):
     """`axis.error`.
 
-    From 0.5.5 on it is set when motor, encoder or controller failed; up to 0.5.4 it stayed 0 then.
-    In every version it is 0 for an axis that is idle without an error of its own.
+    From 0.5.5 on it is set if motor, encoder or controller failed; up to 0.5.4 it then stays 0. In
+    every version it is 0 for an axis that is idle without its own error.
     """
 
     NONE = 0
@@ -189,7 +189,7 @@ class Heartbeat(NamedTuple):
 
     @property
     def errors(self) -> int:
-        """`axis_error` with the three flags as the `AxisError` bits of the same meaning."""
+        """`axis_error`, with the three flags added as `AxisError` bits."""
         return (
             self.axis_error
             | self.motor_failed * AxisError.MOTOR_FAILED
@@ -271,7 +271,7 @@ def unpack_float(data: bytes) -> float:
 
 
 def pack_input_pos(pos: float, vel: float, torque: float) -> bytes:
-    """Pack 0x00C; vel and torque travel as int16 in thousandths, saturated at 32.767."""
+    """Pack 0x00C; vel and torque are sent as int16 in thousandths, saturated at 32.767."""
     return _INPUT_POS.pack(pos, _to_milli(vel), _to_milli(torque))
 
 

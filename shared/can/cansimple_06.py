@@ -1,11 +1,11 @@
 """CANSimple of ODrive firmware 0.6, where it differs from 0.5 (`shared.can.cansimple`).
 
-Heartbeat bytes 5 to 7, 0x000 (version), 0x003 (one pair of error words for the axis), 0x004 and
-0x005 (any endpoint, read and written), 0x019 (position in turns as a float, where 0.5 takes
-counts), a byte in 0x018 (to blink), and the numbers of the errors: the watchdog's is 0x0100_0000
-where 0.5 has 0x800. Set-points, limits, gains and estimates are as in 0.5.
+These differ: heartbeat bytes 5 to 7; 0x000 (version); 0x003 (one pair of error words for the axis);
+0x004 and 0x005 (any endpoint, read and written); 0x019 (position in turns as a float, in 0.5 as
+counts); 0x018 (a byte that requests blinking); and the error numbers, such as the watchdog's
+0x0100_0000 (0x800 in 0.5). Set-points, limits, gains and estimates are as in 0.5.
 
-From 0.6.11 on a drive confirms each write of an endpoint by 0x005, as it answers a read.
+From 0.6.11 on, a drive confirms each write of an endpoint with 0x005, just as it answers a read.
 
 Source: docs.odriverobotics.com, manual/can-protocol, the published 0.6.10 .dbc, and the
 enumerations of the `odrive` package 0.6.11.

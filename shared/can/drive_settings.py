@@ -1,11 +1,11 @@
 """Settings that this robot needs on its ODrives: one table, by the names of firmware 0.5.6.
 
 With factory settings an ODrive disarms, limits or answers in ways that make this robot fall
-(docs/drives.md#traps). The simulator sets its drives by this table, `xrl doctor` compares a drive
-with it and `xrl drive configure` writes it, so the three cannot disagree.
+(docs/drives.md#traps). The simulator configures its drives by this table, `xrl doctor` compares a
+drive with it, and `xrl drive configure` writes it, so the three cannot disagree.
 
-The table also has modes, gains and limits that the joint services write at arming or in every
-cycle, if a drive that something else armed would be wrong without them.
+The joint services write some modes, gains and limits at arming or in every cycle. The table also
+contains those of them that a drive needs when another program arms it.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ CAN_BAUD_RATE: Final = 1_000_000
 OVERVOLTAGE_MAX: Final = 59.92
 """V; the firmware's default on a 56 V board. Above it nothing protects the output stage."""
 OVERSPEED_TOLERANCE: Final = 1.2
-"""The firmware's default; closer to 1, a noisy estimate at vel_limit disarms."""
+"""The firmware's default; closer to 1, a noisy estimate at vel_limit would disarm a drive."""
 SPINOUT_POWER: Final = 100.0
-"""W; 10 as shipped. A motor disarms if it brakes with more than this and takes more than this
-beyond the copper loss of its calibrated resistance: its encoder has slipped. A winding at 100 C has
-30 % more resistance: 40 W more at 30 A and 0.1 ohm, 72 W at 40 A."""
+"""W; 10 by default. A drive assumes a slipped encoder, and disarms, if its motor brakes with more
+than this and draws more than this beyond the copper loss at its calibrated resistance. A winding at
+100 C has 30 % more resistance: 40 W more at 30 A and 0.1 ohm, 72 W at 40 A."""
 
 _RELATIVE: Final = 1e-6
-"""Relative tolerance: a drive keeps single floats."""
+"""Relative tolerance: a drive stores single floats."""
 
 
 class Compare(Enum):
@@ -49,7 +49,7 @@ class Compare(Enum):
 
 
 class Need(NamedTuple):
-    """Parameters from which the wanted values are computed."""
+    """Parameters of the wanted values."""
 
     drive: DriveConfig
     encoder_counts_per_turn: int
@@ -72,7 +72,7 @@ class _Setting(NamedTuple):
 
 
 class WantedSetting(NamedTuple):
-    """A setting of one drive, by its whole name, with its computed value."""
+    """A setting of one drive, with its full name and its computed value."""
 
     name: str
     value: Value
@@ -80,7 +80,7 @@ class WantedSetting(NamedTuple):
     compare: Compare
 
     def fits(self, found: Value) -> bool:
-        """Return True if a drive that has this value is as wanted."""
+        """Return True if a value found on a drive fits this setting."""
         if self.compare is not Compare.EQUAL and not math.isnan(found):
             beyond = found > self.value if self.compare is Compare.AT_LEAST else found < self.value
             return beyond or same(found, self.value)
@@ -93,7 +93,7 @@ class WantedSetting(NamedTuple):
 
 AXIS_TABLE: Final[tuple[_Setting, ...]] = (
     _Setting("config.watchdog_timeout", lambda need: need.drive.watchdog_timeout,
-        "a drive that receives nothing disarms after this; if too short, a hiccup disarms it"),
+        "a drive that receives nothing disarms after this; if too short, a delay disarms it"),
     _Setting("config.enable_watchdog",
         lambda need: need.watchdog and need.drive.watchdog_timeout > 0.0,
         "if it fires, the module goes limp: off with the onboard loop, else on"),
@@ -120,7 +120,7 @@ AXIS_TABLE: Final[tuple[_Setting, ...]] = (
     _Setting("controller.config.enable_overspeed_error", lambda _: True,
         "a runaway motor would not be stopped"),
     _Setting("controller.config.enable_torque_mode_vel_limit", lambda _: False,
-        "in torque mode it limits the torque by vel_gain; at vel_gain = 0 no torque is left"),
+        "in torque mode the torque would be limited by vel_gain; at vel_gain = 0 none is left"),
     _Setting("controller.config.spinout_electrical_power_threshold", lambda _: SPINOUT_POWER,
         "an axis that sinks under load with a warm winding disarms (SPINOUT_DETECTED)",
         Compare.AT_LEAST),
@@ -132,7 +132,7 @@ AXIS_TABLE: Final[tuple[_Setting, ...]] = (
     _Setting("motor.config.torque_constant", lambda need: need.drive.torque_constant,
         "every torque would be wrong by the ratio"),
     _Setting("motor.config.current_lim", lambda need: need.drive.current_lim,
-        "less (factory: 10 A) cannot carry the robot; more is beyond the robot file's checks"),
+        "less (factory: 10 A) cannot carry the robot; more is not covered by the file's checks"),
     _Setting("motor.fet_thermistor.config.enabled", lambda _: True,
         "the output stage would not protect itself"),
     _Setting("encoder.config.cpr", lambda need: need.encoder_counts_per_turn,
@@ -174,7 +174,7 @@ def of_every_drive(need: Need) -> dict[str, Value]:
 
 
 def same(one: Value, other: Value) -> bool:
-    """Return True if two values are the same to a drive, which keeps single floats."""
+    """Return True if two values are the same to a drive, which stores single floats."""
     if isinstance(one, float) or isinstance(other, float):
         both_nan = math.isnan(one) and math.isnan(other)
         return both_nan or math.isclose(one, other, rel_tol=_RELATIVE)

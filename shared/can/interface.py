@@ -1,11 +1,11 @@
 """A CAN interface of the kernel: limit the frames that wait in it, and discard them.
 
-From Linux' sources (net/can/raw.c, include/linux/can/skb.h, drivers/net/can/dev): a frame waits in
-the interface's queue (pfifo_fast, txqueuelen), charged to its socket (SO_SNDBUF), then in the
-adapter, charged to nothing. Both outlive the socket. Neither drops a frame for its age; taking the
-interface down does, and resets the adapter. CAN sockets have no SIOCOUTQ, and SO_MEMINFO does not
-count the adapter's frames: the echo of an own frame (CAN_RAW_RECV_OWN_MSGS) is the only sign that
-it was transmitted.
+In Linux (net/can/raw.c, include/linux/can/skb.h, drivers/net/can/dev), a frame waits in the
+interface's queue (pfifo_fast, txqueuelen), where it is charged to its socket (SO_SNDBUF), then in
+the adapter, where it is not. Both queues outlive the socket, and neither drops a frame for its
+age. Taking the interface down drops all frames and resets the adapter. CAN sockets have no
+SIOCOUTQ, and SO_MEMINFO does not count the adapter's frames: only the echo of a sent frame
+(CAN_RAW_RECV_OWN_MSGS) shows that it was transmitted.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def restart(bus: Any, channel: str) -> None:
     """Take a bus's interface down and up again, which discards the waiting frames.
 
     Raises:
-        OSError: this process may not (CAP_NET_ADMIN), or the interface does not exist.
+        OSError: this process lacks CAP_NET_ADMIN, or the interface does not exist.
     """
     own = getattr(bus, "restart", None)
     if own is not None:

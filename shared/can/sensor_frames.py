@@ -1,6 +1,6 @@
 """CAN frames of the load cells and of the IMU: samples as fixed sequences of frames. Pure.
 
-For another amplifier or IMU, change its part of this file and nothing else.
+For another amplifier or IMU, change only its part of this file.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ S = TypeVar("S")
 
 
 def split(frames: Sequence[tuple[int, int]], data: bytes) -> list[tuple[int, bytes]]:
-    """Return the frames (id, data) of a sample's bytes; `frames` has (id, bytes) of each."""
+    """Return a sample's bytes as frames (id, data); `frames` has the id and size of each."""
     found, begin = [], 0
     for can_id, size in frames:
         found.append((can_id, data[begin : begin + size]))
@@ -26,15 +26,15 @@ def split(frames: Sequence[tuple[int, int]], data: bytes) -> list[tuple[int, byt
 
 
 class FrameGroup(Generic[S]):
-    """Assembler of a sample's frames; never mixes frames across a gap.
+    """Assembler of a sample's frames; discards a sample whose frames are out of order.
 
-    A sample consists of the frames (id, bytes), in this order and without another of them in
-    between; `unpack` converts their bytes.
+    A sample consists of the frames (id, number of bytes) in this order, each once; `unpack`
+    converts their joined bytes.
     """
 
     def __init__(self, frames: Sequence[tuple[int, int]], unpack: Callable[[bytes], S]) -> None:
         self.malformed = 0
-        """Sensor frames of a wrong length or out of order."""
+        """Number of sensor frames of a wrong length or out of order."""
         self._unpack = unpack
         self._index = {can_id: index for index, (can_id, _) in enumerate(frames)}
         self._bytes = [size for _, size in frames]
@@ -43,7 +43,7 @@ class FrameGroup(Generic[S]):
         self._next = 0
 
     def add(self, can_id: int, data: bytes | bytearray) -> S | None:
-        """Take one frame; return the sample that it completes, or None.
+        """Add one frame; return the sample that it completes, or None.
 
         Frames of other ids are ignored.
         """
@@ -69,7 +69,7 @@ class FrameGroup(Generic[S]):
         return self._unpack(bytes(self._data))
 
     def reset(self) -> None:
-        """Discard an incomplete sample: its rest belongs to another link."""
+        """Discard an incomplete sample, whose remaining frames were lost."""
         self._next = 0
 
 
@@ -82,7 +82,7 @@ _FLOAT32: Final = struct.Struct("<f")
 
 
 def as_sent(force: float) -> float:
-    """Return a force in N as it comes out of the frames, rounded to float32."""
+    """Return a force in N, rounded to float32 as in the frames."""
     value: float = _FLOAT32.unpack(_FLOAT32.pack(force))[0]
     return value
 
@@ -130,7 +130,7 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     """One sample of the IMU."""
 
     quaternion: Vector4
-    """w, x, y, z: turns sensor axes into axes whose z is up."""
+    """w, x, y, z: rotates vectors from sensor axes to axes whose z is up."""
     rate: Vector3
     """rad/s, sensor axes."""
     valid: bool
@@ -161,9 +161,9 @@ def _imu_sample(data: bytes) -> ImuSample:
 class ImuAssembler(FrameGroup[ImuSample]):
     """Assembler of an Xsens MTi 600's frames: the part of its protocol that is used.
 
-    The MTi is an AHRS with CAN: its orientation is good to 0.2 .. 0.5 degrees in roll and pitch. In
-    the MT Manager's CAN output, switch on StatusWord, Quaternion and RateOfTurn, with standard
-    identifiers and the same rate. All is big-endian (MT CAN protocol, MT1604P).
+    The MTi is an AHRS with CAN; its roll and pitch are accurate to 0.2 .. 0.5 degrees. In the MT
+    Manager's CAN output, switch on StatusWord, Quaternion and RateOfTurn, with standard identifiers
+    and the same rate. All values are big-endian (MT CAN protocol, MT1604P).
 
         id 0x11   uint32      status; bit 1: the orientation is valid
         id 0x21   4 int16     quaternion w, x, y, z in 2^-15: sensor axes to (east, north, up)

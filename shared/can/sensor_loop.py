@@ -17,7 +17,7 @@ class Sensor(Protocol[S_co]):
     """Source of a sensor's samples."""
 
     def newest(self, now_ns: int, /) -> S_co | None:
-        """Return the newest sample that came since the last call, or None; never blocks.
+        """Return the newest sample that arrived since the last call, or None; never blocks.
 
         Never raises for a lost link; returns None until it is back.
         """
@@ -27,8 +27,8 @@ class SensorLoop(ABC, Generic[S, M]):
     """One cycle: read, make a message, publish.
 
     Attributes:
-        cycles: so far.
-        skipped: deadlines that were missed and not made up for.
+        cycles: number of cycles so far.
+        skipped: missed deadlines, whose cycles were left out.
         unsent: messages that the bus did not accept.
     """
 
@@ -39,11 +39,11 @@ class SensorLoop(ABC, Generic[S, M]):
     @property
     @abstractmethod
     def refused(self) -> int:
-        """Samples that no sensor can have measured."""
+        """Number of implausible samples so far."""
 
     @abstractmethod
     def message(self, now_ns: int, sample: S | None) -> M:
-        """Return the message to publish for the newest sample, which is None without a new one."""
+        """Return the message to publish; `sample` is None if no new one arrived."""
 
     def cycle(self, now_ns: int) -> M:
         """Run once; return the published message."""

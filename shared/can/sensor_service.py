@@ -1,4 +1,4 @@
-"""Process of a service that reads a sensor: cycles on a grid of periods until it is stopped."""
+"""Process of a service that reads a sensor: one cycle per period until it is stopped."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class SensorService(NamedTuple):
 def serve(name: str, about: str, made: Callable[[RobotConfig, Path], SensorService]) -> int:
     """Run a service until SIGTERM or SIGINT; return the exit code.
 
-    `made` makes the service from the robot and the run directory; `about` is the text of `--help`.
+    `made` constructs the service from the robot and the run directory; `about` is the text of
+    `--help`.
     """
     parser = process.service_parser(about, f"python -m services.{name}")
     process.add_injected(parser)
@@ -46,8 +47,8 @@ def serve(name: str, about: str, made: Callable[[RobotConfig, Path], SensorServi
         run(loop, service.rate_hz, stop)
     sensor.close()
     logger.info(
-        "stopped: %d cycles, %d skipped, %d unsent, link opened %d times; "
-        "samples that were not %s: %d, malformed frames: %d",
+        "stopped: %d cycles, %d skipped, %d unsent; "
+        "times the link was opened: %d, samples that were not %s: %d, malformed frames: %d",
         loop.cycles, loop.skipped, loop.unsent, sensor.opened,
         service.refused_for, loop.refused, sensor.malformed,
     )  # fmt: skip
@@ -55,7 +56,7 @@ def serve(name: str, about: str, made: Callable[[RobotConfig, Path], SensorServi
 
 
 def next_deadline(deadline_ns: int, period_ns: int, now_ns: int) -> tuple[int, int]:
-    """Return the next deadline after now on the grid of periods, and how many were missed."""
+    """Return the next deadline after now, on the grid of periods, and the number missed."""
     missed = max(0, (now_ns - deadline_ns) // period_ns)
     return deadline_ns + (missed + 1) * period_ns, missed
 

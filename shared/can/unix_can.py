@@ -1,18 +1,18 @@
 """A CAN bus on one host: python-can over a UNIX socket (docs/drives.md).
 
 `UnixCanBus` is the client, `can.Bus(interface="xrl_unix", channel=path)`; the bus itself is
-`services.simulator.fronts.unix_can_hub.UnixCanHub`, held by the simulator. The code that drives a
-real bus through socketcan drives this one unchanged.
+`services.simulator.fronts.unix_can_hub.UnixCanHub`, in the simulator. The code that drives a real
+bus through socketcan drives this one unchanged.
 
 On the wire: SOCK_SEQPACKET; a packet carries one or several 16-byte frames in the layout of
 SocketCAN's `struct can_frame` (id and flags, length, three pad bytes, eight data bytes),
 little-endian. Several frames in one packet cost one system call. Sending never blocks: a full queue
 raises, as on socketcan.
 
-**A bus that does not acknowledge.** The hub then leaves the packets in the kernel, in order and
-charged to the sender (SO_SNDBUF), even after the sender's end. A CAN interface behaves the same:
-its controller repeats its first frame until a node acknowledges it. Both sides share the rest of an
-interface's state in `Interface`.
+**While no node acknowledges,** the hub leaves the packets in the kernel, in order and charged to
+the sender (SO_SNDBUF), even after the sender has ended. A CAN interface behaves the same: its
+controller repeats its first frame until a node acknowledges it. Hub and clients share the rest of
+an interface's state in `Interface`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ PACKET_BYTES: Final = 64 * FRAME_BYTES
 """Maximum packet of either side."""
 _DRAIN = 1024  # packets in one call: more than a socket holds
 FRAME_TRUESIZE: Final = 768
-"""Bytes that a short packet takes of SO_SNDBUF: sk_buff and data; a CAN frame takes the same."""
+"""Bytes of SO_SNDBUF for a short packet (sk_buff and data); a CAN socket's frame takes as many."""
 
 
 def pack_frames(frames: Iterable[Frame]) -> bytes:
@@ -76,7 +76,7 @@ class Interface:
         """Open the state of the interface with this socket; the hub creates it.
 
         Raises:
-            OSError: it does not exist.
+            OSError: the state does not exist.
         """
         self.path = Path(f"{os.fspath(channel)}.state")
         if create:  # a client of an earlier hub may still have the old file mapped
@@ -92,7 +92,7 @@ class Interface:
 
     @property
     def full(self) -> bool:
-        """True while the send queue (txqueuelen) takes no frame: ENOBUFS."""
+        """True while the send queue (txqueuelen) accepts no frame: ENOBUFS."""
         return self.memory[FULL_AT] != 0
 
     @full.setter
@@ -101,7 +101,7 @@ class Interface:
 
     @property
     def restarts(self) -> int:
-        """Times the interface was taken down and up; each empties its queue."""
+        """Number of times the interface was taken down and up, which empties its queue."""
         return int.from_bytes(self.memory[:FULL_AT], "little")
 
     def restart(self) -> None:
@@ -130,7 +130,7 @@ class UnixCanBus(can.BusABC):
         receive_own_messages: bool = False,
         **kwargs: object,
     ) -> None:
-        """Connect to the hub that listens on path `channel`, or can.CanInitializationError.
+        """Connect to the hub on path `channel`; raise can.CanInitializationError if there is none.
 
         With `receive_own_messages`, `carried` returns this client's own frames once the bus has
         carried them (as CAN_RAW_RECV_OWN_MSGS does).
@@ -147,7 +147,7 @@ class UnixCanBus(can.BusABC):
         super().__init__(channel, can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
-        """Send one frame without waiting, whatever `timeout` says.
+        """Send one frame without waiting, regardless of `timeout`.
 
         Raises:
             can.CanOperationError: the queue is full (ENOBUFS), or the hub is gone.
@@ -160,7 +160,7 @@ class UnixCanBus(can.BusABC):
     def send_packet(self, packet: bytes) -> int:
         """Send packed frames without waiting; return the number of bytes sent: all, or 0.
 
-        The fast path around `can.Message`. The loss of the hub shows when receiving.
+        The fast path, which avoids `can.Message`. If the hub is gone, only receiving raises.
         """
         if not self._interface.memory[FULL_AT]:
             try:
@@ -175,10 +175,10 @@ class UnixCanBus(can.BusABC):
         return 0
 
     def recv_packet(self, timeout: float) -> bytes:
-        """Wait for a packet and return all packets that have arrived as one, in order.
+        """Wait for a packet; return all packets that have arrived, joined in order.
 
-        The fast path around `can.Message`; filters are not applied. Empty after `timeout` seconds.
-        Raises can.CanOperationError once the hub is gone.
+        The fast path, which avoids `can.Message`; filters are not applied. Returns b"" if no packet
+        arrives within `timeout` seconds. Raises can.CanOperationError once the hub is gone.
         """
         packet = self._receive(timeout)
         if packet is None:
@@ -214,7 +214,7 @@ class UnixCanBus(can.BusABC):
         return self.socket.fileno()
 
     def shutdown(self) -> None:
-        """Leave the bus; waiting frames keep waiting."""
+        """Leave the bus; frames in its queue stay there."""
         super().shutdown()
         self.socket.close()
         self._interface.close()
@@ -232,10 +232,10 @@ class UnixCanBus(can.BusABC):
     def _receive(self, timeout: float | None) -> bytes | None:
         """Return a packet of whole frames, or None after `timeout` seconds without one.
 
-        The kernel keeps the time (SO_RCVTIMEO): one system call instead of two.
+        The kernel measures the timeout (SO_RCVTIMEO): one system call instead of two.
         """
         if timeout is not None and timeout <= 0.0:
-            if not self._poll.poll(0):  # a third of the price of a BlockingIOError
+            if not self._poll.poll(0):  # takes a third of the time of a BlockingIOError
                 return None
         elif timeout != self._timeout_s:
             _set_receive_timeout(self.socket, timeout)

@@ -1,8 +1,8 @@
 """Load of a CAN bus with drives at 1 Mbit/s (docs/drives.md). Pure.
 
 A standard data frame with n bytes is 47 + 8n bits long, including the gap after it. After five
-equal bits the sender stuffs one more, up to the end of the checksum: over 34 + 8n bits at most one
-in four. `STUFFING` was measured on this robot's frames.
+equal bits the sender inserts a stuff bit, up to the end of the checksum: at most one per four of
+the 34 + 8n bits. `STUFFING` was measured on this robot's frames.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from shared.exceptions import ConfigError
 BITRATE: Final = 1_000_000
 """bit/s"""
 LOAD_MAX: Final = 0.85
-"""Maximum planned load of a bus. Requests, arming and errors come on top, and a full bus delays a
-frame by everything queued before it. Torques for 12 axes at 333 Hz, with heartbeats at 10 Hz, are
-82 %."""
+"""Maximum planned load of a bus. Requests, arming and errors add to it, and on a full bus a frame
+waits for all frames queued before it. Torques for 12 axes at 333 Hz, with heartbeats at 10 Hz, take
+81 %."""
 STUFFING: Final = 0.06
 """Stuff bits per bit that can be stuffed; 0.05 while the robot stands."""
 BLEND_MAX: Final = 0.98
@@ -26,13 +26,13 @@ joints are controlled on old samples."""
 GAINS_HZ: Final = 10.0
 """Rate at which the onboard loop's gains are sent when they do not change."""
 BLEND_HZ: Final = 125.0
-"""Their rate while they blend: `GAIN_UPDATE_MIN_MS` of `services.joint.drive_setpoint`."""
+"""Rate of the gains while they blend: `GAIN_UPDATE_MIN_MS` of `services.joint.drive_setpoint`."""
 LOADCELL_FRAMES: Final = 3
 """Frames per sample of the harness sensor."""
 
 
 class _BusLoad(NamedTuple):
-    """Load of a bus, as a fraction of it."""
+    """Load of a bus, as a fraction of its capacity."""
 
     steady: float
     blending: float
@@ -59,8 +59,8 @@ def bus_load(
 ) -> _BusLoad:
     """Return the load of a bus: per cycle, an estimate from each axis and a target to it.
 
-    Onboard, each target takes 8 bytes, and the gains come on top; else each torque takes 4.
-    `loadcell_rate_hz` is the sample rate of a harness sensor on this bus.
+    With `onboard`, each target has 8 bytes, and gains are sent too; otherwise each torque has 4
+    bytes. `loadcell_rate_hz` is the sample rate of a harness sensor on this bus.
     """
     full, half = frame_bits(8), frame_bits(4)
     gains = full + half if onboard else 0.0
@@ -71,7 +71,7 @@ def bus_load(
 
 
 def check_buses(file: str, config: RobotConfig) -> None:
-    """Refuse a bus that cannot carry the modules on it: ConfigError says what it can carry."""
+    """Raise ConfigError if a bus cannot carry its modules; the error says how many it can carry."""
     service = config.joint_service
     if service.driver != "odrive_can":
         return
@@ -92,11 +92,13 @@ def check_buses(file: str, config: RobotConfig) -> None:
         ]
         load, carried = loads[-1], sum(load.fits for load in loads)
         if not load.fits:
+            s, most_s = "s" * (len(names) != 1), "s" * (carried != 1)
+            fewer = f"connect at most {carried} module{most_s} to a bus at this rate, or "
             raise ConfigError(
                 file,
                 f"can.{names[0]}",
-                f"{len(names)} modules at {service.rate_hz:g} Hz would load the bus to "
+                f"{len(names)} module{s} at {service.rate_hz:g} Hz would load the bus to "
                 f"{load.steady:.0%} of 1 Mbit/s ({load.blending:.0%} while gains blend)",
-                f"must be at most {LOAD_MAX:.0%} ({BLEND_MAX:.0%}): connect at most {carried} "
-                "modules to a bus at this rate, or lower joint_service.rate_hz",
+                f"must be at most {LOAD_MAX:.0%} ({BLEND_MAX:.0%}): "
+                f"{fewer if carried else ''}lower joint_service.rate_hz",
             )

@@ -1,4 +1,4 @@
-"""Checks between the values of a robot file (`shared.config.robot_config`)."""
+"""Checks of a robot file's values against each other (`shared.config.robot_config`)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shared.exceptions import ConfigError
 from shared.joints import KINDS, MODULES
 
 Problems: TypeAlias = Iterator[tuple[str, str, str]]
-"""Key, found value, right value. The first problem refuses the file."""
+"""Key, found value and right value of each problem; only the first is reported."""
 
 INTERFACES: Final = (
     "canalystii", "cantact", "etas", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi",
@@ -32,18 +32,18 @@ INTERFACES: Final = (
 ROS2_DISTRIBUTIONS: Final = ("jazzy", "kilted", "lyrical")
 """Distributions whose Zenoh messages the gateway supports (`services.ros2_gateway`)."""
 CURRENT_RANGE: Final = 60.0
-"""A; maximum current that a drive measures, the firmware's default of
+"""Maximum current that a drive measures, A: the firmware's default of
 `motor.config.requested_current_range`."""
 LEADABLE: Final = (2, 4)
 """Rows of p that a person may lead: height and pitch."""
 _POWER_UP_TURNS: Final = 1.0
-"""Turns within which an encoder knows its motor's position at power-up."""
+"""Maximum count of an encoder at power-up, turns."""
 
 
 def check(file: str, config: RobotConfig) -> None:
     """Check values against each other: duplicates, crossed limits, dangling names.
 
-    Each value alone is in its range already; the ConfigError names `file`.
+    The range of each value is already checked. The ConfigError names `file`.
     """
     for problems in (_names, _interfaces, _physics, _drive, _timing):
         _refuse(file, problems(config))
@@ -53,7 +53,7 @@ def check(file: str, config: RobotConfig) -> None:
 def check_security(file: str, config: RobotConfig) -> None:
     """Check that the endpoints fit `bus.security.mode`; not for a robot from a log.
 
-    Raises ConfigError if a port would be open to anyone, and the file does not say so.
+    Raises ConfigError, for example, if anyone could reach a port although the mode is not `open`.
     """
     _refuse(file, _security(config))
 
@@ -155,7 +155,7 @@ def _ros2(config: RobotConfig) -> Problems:
     if ros2.distribution not in ROS2_DISTRIBUTIONS:
         found = f"{ros2.distribution!r} is not supported"
         if ros2.distribution == "humble":
-            found += ": its topics have no type hash, so no node would find these"
+            found += ": its topics have no type hash, so its nodes would not find the gateway's"
         yield "ros2.distribution", found, f"use one of {_words(ROS2_DISTRIBUTIONS)}"
     if ros2.router.startswith("unixsock") or not is_endpoint(ros2.router):
         yield (
@@ -288,7 +288,7 @@ def _drive(config: RobotConfig) -> Problems:
         found = f"{drive.current_lim:g} A is more than an ODrive v3 can measure"
         right = f"must be at most {CURRENT_RANGE:g} A, its requested_current_range"
         yield "drive.current_lim", found, right
-    # Up to vel_limit_tolerance times vel_limit remain for the other axis.
+    # The range up to vel_limit_tolerance times vel_limit is left for the other axis's speed.
     speed = config.joint_service.v_max * turns_per_rad
     if drive.vel_limit < speed:
         found = f"{drive.vel_limit:g} turn/s is slower than joint_service.v_max"
@@ -299,13 +299,13 @@ def _drive(config: RobotConfig) -> Problems:
     if drive.zero_mark_turns < least:
         found = f"{drive.zero_mark_turns:g} turns: the {kind} can reach half of it"
         if drive.zero_mark_turns == 0.0:
-            found = "0 turns: a drive that lost power would be armed wherever its joint is"
+            found = "0 turns: a drive that lost power would be armed in any position of its joint"
         right = f"must be at least {math.ceil(least)} turns, twice a joint's range"
         yield "drive.zero_mark_turns", found, right
 
 
 def _turns(config: RobotConfig, kind: str) -> float:
-    """Return the farthest that a joint's motors can be from q = 0 or from power-up, turns.
+    """Return the maximum distance of a joint's motors from q = 0 or from power-up, turns.
 
     A motor turns by gear_ratio (theta +- phi).
     """
@@ -348,12 +348,12 @@ def _timing(config: RobotConfig) -> Problems:
         yield "drive.watchdog_timeout", found, "must be 0 s (off)"
     if service.loop == "service" and drive.watchdog_timeout < 10e-3 * period_ms:
         found = f"{drive.watchdog_timeout:g} s is under ten control periods"
-        right = f"must be at least {10e-3 * period_ms:g} s, or a hiccup disarms the drive"
+        right = f"must be at least {10e-3 * period_ms:g} s, or a short delay disarms the drive"
         yield "drive.watchdog_timeout", found, right
     command_period_ms = 1e3 / config.planner.rate_hz
     if service.max_command_age_ms < 3 * command_period_ms:
         found = f"{service.max_command_age_ms:g} ms is under three planner periods"
-        right = f"must be at least {3 * command_period_ms:g} ms, or every hiccup is a drop-out"
+        right = f"must be at least {3 * command_period_ms:g} ms, or a short delay is a dropout"
         yield "joint_service.max_command_age_ms", found, right
 
 

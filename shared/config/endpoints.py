@@ -1,4 +1,4 @@
-"""Endpoints of the bus, and placeholders in texts of files."""
+"""Endpoints of the bus, and placeholders in configuration texts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.exceptions import BusError
 
 PORT_MAX: Final = 65_535
 RUN: Final = "{run}"
-"""Placeholder of the run directory, in endpoints and channels."""
+"""Placeholder of the fleet's live directory, in endpoints and channels."""
 ROBOT: Final = "{robot}"
 """Placeholder of the robot's name, in `bus.security.keys`."""
 _UNIX: Final = re.compile(r"unixsock-stream/[^?#]+")
@@ -23,7 +23,7 @@ _BRACES: Final = re.compile(r"\{[^{}]*\}?|\}")
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
-    """Return host and port of tcp/HOST:PORT, tls/[HOST]:PORT and the like, else BusError."""
+    """Return host and port of tcp/HOST:PORT or tls/[HOST]:PORT; raise BusError for other texts."""
     found = _ADDRESS.fullmatch(endpoint)
     if found is None or not 0 < int(found[2]) <= PORT_MAX:
         raise BusError(
@@ -44,7 +44,7 @@ def is_endpoint(text: str) -> bool:
 
 
 def filled(text: str, values: Mapping[str, str]) -> str:
-    """Return a text with all its placeholders replaced, for example by `{"{run}": "/tmp/x"}`."""
+    """Return a text with the placeholders in `values`, such as {run}, replaced; others remain."""
     return _PLACEHOLDER.sub(lambda found: values.get(found[0], found[0]), text)
 
 

@@ -1,7 +1,7 @@
 """Read and write a robot file, `deploy/robot.toml`, and the files beside it.
 
-The gain schedule, `robot.gains.json`, and the wearer's thresholds, `robot.wearer.toml`, are files
-of their own: one follows from the robot, the other from the person.
+The gain schedule, `robot.gains.json`, and the wearer's thresholds, `robot.wearer.toml`, are
+separate files: one is computed from the robot, the other belongs to a person.
 
 Unknown keys, wrong sizes and impossible values are refused; the error names the file, the key, the
 value and the right value (`shared.exceptions.ConfigError`).
@@ -47,14 +47,14 @@ def worn_by(config: RobotConfig, wearer: WearerThresholds) -> RobotConfig:
 
 
 def load_without_schedule(path: Path) -> RobotConfig:
-    """Read and check a robot file alone, or ConfigError."""
+    """Read and check a robot file alone; raise ConfigError if it is invalid."""
     config = _checked(read_toml(path, RobotConfig), str(path))
     config_check.check_security(str(path), config)
     return config
 
 
 def parse(text: str, file: str) -> RobotConfig:
-    """Return the robot that a TOML text describes, without a gain schedule, or ConfigError."""
+    """Return the robot of a TOML text, without a schedule; raise ConfigError if it is invalid."""
     return _checked(parse_toml(text, file, RobotConfig), file)
 
 

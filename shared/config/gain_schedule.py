@@ -1,8 +1,8 @@
-"""The certified gain schedule: a file beside the robot's, made offline by `xrl gains`.
+"""The certified gain schedule, a file beside the robot file that `xrl gains` writes.
 
-Local joint stiffnesses over COM height and torso pitch (docs/law.md#gain-split). The file holds the
-parameters from which it was computed; a robot that differs is refused until `xrl gains` has run
-again.
+It contains local joint stiffnesses over COM height and torso pitch (docs/law.md#gain-split), and
+the parameters from which it was computed. A robot with other parameters is refused until `xrl
+gains` runs again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shared.joints import KINDS, MODULES, kind_of
 from shared.toml_file import check_ranges, read_text
 
 VERSION = 2
-"""Version of the file and of the program that makes it; `xrl gains` remakes any other version."""
+"""Version of the file and of its program; `xrl gains` remakes a file of any other version."""
 
 
 _INPUTS: Final[dict[str, tuple[str, ...]]] = {
@@ -55,7 +55,7 @@ one row of numbers."""
 
 
 def inputs_of(config: RobotConfig) -> dict[str, Any]:
-    """Return everything that the schedule depends on, by dotted key."""
+    """Return the inputs of the schedule, by dotted key."""
     flat: dict[str, Any] = {}
     for section, keys in _INPUTS.items():
         table: dict[str, Any] = msgspec.to_builtins(getattr(config, section))
@@ -67,7 +67,7 @@ def inputs_of(config: RobotConfig) -> dict[str, Any]:
                 ]
             flat[f"{section}.{key}"] = value
     if not any(config.mass.payload_com):
-        del flat["mass.payload_com"]  # schedules without this key are still right
+        del flat["mass.payload_com"]  # schedules without this key remain valid
     plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(flat))
     return plain
 
@@ -78,13 +78,13 @@ def digest_of(inputs: dict[str, Any]) -> str:
 
 
 def path_beside(robot_file: Path) -> Path:
-    """Return the schedule's file of a robot file: lab.toml -> lab.gains.json."""
+    """Return the path of a robot file's gain schedule: lab.toml -> lab.gains.json."""
     return robot_file.with_suffix(".gains.json")
 
 
 def read(path: Path) -> GainSchedule | None:
-    """Read a schedule; None if the file is missing, ConfigError if it is invalid."""
-    again = "make it again with `xrl gains`"
+    """Read a schedule; return None if the file is missing, raise ConfigError if it is invalid."""
+    again = "make the file again with `xrl gains`"
     try:
         schedule = msgspec.json.decode(read_text(path), type=GainSchedule)
     except FileNotFoundError:
@@ -95,7 +95,8 @@ def read(path: Path) -> GainSchedule | None:
         raise ConfigError(str(path), "(file)", f"is not a gain schedule: {error}", again) from None
     for name, nodes in (("z", schedule.z), ("pitch", schedule.pitch)):
         if len(nodes) < 2 or any(b <= a for a, b in pairwise(nodes)):
-            raise ConfigError(str(path), name, "the nodes do not increase", again)
+            found = "has fewer than two nodes, or they do not increase"
+            raise ConfigError(str(path), name, found, again)
     try:
         check_ranges(str(path), schedule)
     except ConfigError as error:
@@ -142,7 +143,7 @@ def write(path: Path, schedule: GainSchedule) -> None:
 
 
 def why_stale(config: RobotConfig) -> str:
-    """Return why the robot's schedule does not fit the robot, in words; "" if it does."""
+    """Return why the gain schedule does not fit the robot; "" if it fits."""
     schedule = config.gain_schedule
     if schedule is None:
         return "the gain schedule is missing"
@@ -161,9 +162,10 @@ def why_stale(config: RobotConfig) -> str:
 
 
 def believing(config: RobotConfig) -> RobotConfig:
-    """Return the robot with joint services that accept any command within their limits.
+    """Return the robot without the command bounds of its gain schedule.
 
-    For commands that the shipped law never sends: another controller, or gains under study.
+    Its joint services then accept any command within their limits. Use it for commands that the
+    shipped law never sends: those of another controller, or with gains under study.
     """
     if config.gain_schedule is None:
         return config

@@ -22,14 +22,14 @@ Bounds: TypeAlias = tuple[tuple[float, float], tuple[float, float]]
 
 
 class ModuleBounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Bounds of the commands of one kind of module, over all poses and every assist."""
+    """Bounds on the commands to one kind of module, over all poses and every assist."""
 
     k_p: Bounds
-    """N m/rad; up to the stand gains and k_q_fraction_max of K_q, to which a split is stiffened."""
+    """N m/rad; includes the stand gains, and the stiffest split: k_q_fraction_max times K_q."""
     k_d: Bounds
     """N m s/rad"""
     theta: tuple[float, float]
-    """rad; range of the joint over which `tau_ff` is given, in equal parts."""
+    """Range of theta, rad; each entry of `tau_ff` is for an equal part of it."""
     tau_ff: tuple[Bounds, ...]
     """N m, by theta, for both legs: the bounds of phi are symmetric."""
     v_ref: tuple[float, float]
@@ -55,7 +55,7 @@ class GainSchedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     coupling_bandwidth_hz: Annotated[float, Range(0.1, 100.0, "Hz")]
     """Bandwidth of the two poles of tau_coupled."""
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
-    """Maximum `law.lead_easing` with which the loop is stable; less is always safe."""
+    """Maximum `law.lead_easing` with which the loop is stable; smaller values are stable too."""
     coupling_damping: Annotated[float, Range(0.0, 10.0, "1")]
     """Damping that the local gains and tau_coupled reach together, as a fraction of B_p."""
     bounds: dict[str, ModuleBounds] | None = None

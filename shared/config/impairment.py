@@ -1,8 +1,8 @@
 """Seeded model of a bad network: delay, jitter, loss, partitions. Pure.
 
-Terms are those of tc-netem where it has them. Lockstep's modelled network and the network proxy on
-the wire use the same class, so both behave alike (docs/networks.md). In lockstep it acts on
-messages, on the wire on Zenoh's batches: messages sent at once travel, and are lost, together.
+Terms are tc-netem's, if it has them. Lockstep's modelled network and the network proxy on the wire
+use the same class, so both behave alike (docs/networks.md). In lockstep it acts on messages; on the
+wire it acts on Zenoh's batches, so messages that are sent together travel, or are lost, together.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ class Impairment(Section, frozen=True, kw_only=True):
 
     delay_ms: Ms = 0.0
     jitter_ms: Ms = 0.0
-    """uniform: delay +- jitter; normal, pareto: the standard deviation. A negative sum of delay and
-    jitter counts as no delay."""
+    """uniform: the delay varies by +- jitter; normal, pareto: jitter is its standard deviation. A
+    negative delay counts as none."""
     distribution: Distribution = "uniform"
     loss: Share = 0.0
     """Probability that a message is lost."""
     burst: Annotated[float, Range(1.0, 10_000.0, "messages")] = 1.0
     """Mean number of consecutive losses (a Gilbert chain); 1: independent losses."""
     duplicate: Share = 0.0
-    """Probability that a message is duplicated; each copy has a delay of its own."""
+    """Probability that a message is duplicated; each copy has its own delay."""
     reorder: Share = 0.0
     """Probability that a message has no delay and so overtakes those before it."""
     rate: Annotated[float, Range(0.0, 1e10, "bytes/s")] = 0.0
     """Capacity of the line; 0: unlimited."""
     ordered: bool = False
     """True: as on a stream (TCP), a late message delays those behind it, and a partition holds all
-    back until its end; but a lost message is not sent again. False: as datagrams, messages are
-    overtaken and lost."""
+    messages until its end; but a lost message is not sent again. False: messages behave like
+    datagrams, and a partition loses them."""
     partition: bool = False
     """Nothing passes."""
 
     def describe(self) -> str:
-        """Return the impairment as `--inject` takes it: `delay=30ms loss=20%`, or `nothing`."""
+        """Return the impairment as `--inject` writes it: `delay=30ms loss=20%`, or `nothing`."""
         words = [
             f"{name}={_digits(value, places)}{unit}"
             for name, value, standard, places, unit in (
@@ -100,18 +100,18 @@ class Impairment(Section, frozen=True, kw_only=True):
 
 
 def _digits(value: float, places: int) -> str:
-    """Return a number times 10**places; its digits, read again, are the same number."""
+    """Return a number times 10**places as text that parses back to the same number."""
     return f"{Decimal(repr(value)).scaleb(places).normalize():f}"
 
 
 class Impairer:
-    """Seeded decision when each message of one direction comes out, and how often."""
+    """Seeded release times of the messages of one direction."""
 
     def __init__(self, what: Impairment, seed: str) -> None:
         self.what = what
         self.passed = self.lost = 0
-        """Messages that came out, or will; and messages that were lost. A duplicated message counts
-        once.
+        """Numbers of messages that were or will be released, and of messages that were lost. A
+        duplicated message counts once.
         """
         self._random = random.Random(seed)
         self._in_burst = False
@@ -119,9 +119,9 @@ class Impairer:
         self._last_ns = 0
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
-        """Take in a message of `size` bytes; return its release times, ns: none, one or two.
+        """Accept a message of `size` bytes; return its release times, ns: none, one or two.
 
-        The clock is any monotonic one.
+        `now_ns` is a time of any monotonic clock.
         """
         what = self.what
         if (what.partition and not what.ordered) or (what.loss and self._is_lost()):
@@ -136,10 +136,10 @@ class Impairer:
         return (release_ns, self._release_ns(now_ns, size)) if twice else (release_ns,)
 
     def delays(self, now_ns: int) -> int:
-        """Return the release time of a link's own traffic, ns: in order, never lost.
+        """Return the release time, ns, of a link's own traffic.
 
-        Such traffic opens, declares and keeps alive; it takes the mean delay. `HELD` in a
-        partition.
+        This traffic opens links, declares keys and keeps links alive. It stays in order and is
+        never lost. It has the mean delay; in a partition its release time is `HELD`.
         """
         if self.what.partition:
             return HELD
@@ -148,7 +148,7 @@ class Impairer:
         return self._last_ns
 
     def drop(self) -> None:
-        """Count a message that has passed as lost: its link ended before it came out."""
+        """Count a passed message as lost, because its link ended before the release."""
         self.passed -= 1
         self.lost += 1
 
@@ -194,9 +194,9 @@ class Impairer:
 class Direction:
     """One direction of a link, and its present impairment.
 
-    Several impairments may be requested at once; one is active: a partition before all others,
-    otherwise the one that started last. When it ends, the next by that rule is active. The owner of
-    the queue keeps a stream in order over such a change.
+    Several impairments may be requested at once; one is active: the newest partition, or without a
+    partition the newest impairment. When it ends, the next by this rule is active. The owner of
+    the queue keeps a stream in order during this change.
     """
 
     def __init__(self, name: str, seed: int) -> None:
@@ -222,7 +222,7 @@ class Direction:
         return self._asked.get(number)
 
     def passes(self, now_ns: int, size: int) -> tuple[int, ...]:
-        """Take in a message; return its release times, ns. As `Impairer.passes`."""
+        """Accept a message; return its release times, ns, as `Impairer.passes` does."""
         return (now_ns,) if self.active is None else self.active.passes(now_ns, size)
 
     def _choose(self) -> None:

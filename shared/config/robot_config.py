@@ -15,7 +15,7 @@ from shared.toml_file import Section
 SERVICES = ("planner", "harness", "imu", "recorder", "simulator", *MODULES)
 """Every service that a fleet can have; each has an endpoint on the bus."""
 OPTIONAL = ("imu",)
-"""Services that not every robot has (`RobotConfig.services`)."""
+"""Services that only some robots have (`RobotConfig.services`)."""
 
 ENDPOINTS_OF_MODE = {
     "local": ("unixsock-stream/",),
@@ -33,7 +33,7 @@ class RobotConfig(Section, frozen=True):
 
     name: str
     assumed: tuple[str, ...]
-    """Keys whose values the paper does not give; measure them, and remove them from this list."""
+    """Keys whose values the paper does not give: measure them, then remove them from this list."""
     mass: sections.MassConfig
     geometry: sections.GeometryConfig
     joint: sections.JointConfig
@@ -60,7 +60,7 @@ class RobotConfig(Section, frozen=True):
     park: sections.ParkConfig = sections.ParkConfig()
     ros2: sections.Ros2Config = sections.Ros2Config()
     gain_schedule: GainSchedule | None = None
-    """From the file beside this one; None if it is missing."""
+    """From the file beside the robot file; None if it is missing."""
 
     @property
     def services(self) -> tuple[str, ...]:
@@ -78,7 +78,7 @@ class RobotConfig(Section, frozen=True):
         return next(module for module in self.module if module.name == name)
 
     def motor_signs(self) -> tuple[int, ...]:
-        """Return the counting direction of the 12 motors, axis0 and axis1 of each module."""
+        """Return the counting directions of the 12 motors, axis0 and axis1 of each module."""
         return tuple(s for name in MODULES for s in self.module_named(name).motor_signs)
 
     def joint_limits(self) -> tuple[tuple[float, float], ...]:
@@ -95,18 +95,16 @@ class RobotConfig(Section, frozen=True):
         return gains
 
     def hold_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return (k_p, k_d) to which a module's gains rise where no tau_coupled holds it.
+        """Return (k_p, k_d) to which a module's gains rise when tau_coupled is off.
 
-        The stand gains of ankles, knees and every phi, zero elsewhere; (phi, theta), N m/rad and N
-        m s/rad. With the commanded gains unchanged, the operator's 60 N m of pitch moment in the
-        crawl leaned the COM back by 42 mm and the soles tipped. Pushes from the side tipped them in
-        15 of 500 random cases. With the knees' theta soft, one leg gave under a lasting push from
-        the side: it stood 25 N for 3 s, with stiff ones 75 N. The hips' theta stays soft: a stiff
-        torso passes all the moment of a hand that keeps leading to the soles, and 6 of 300 fell.
+        (phi, theta), N m/rad and N m s/rad: the stand gains for every phi, and for the theta of the
+        kinds in `hold_stiffens_theta` (reasons in `deploy/robot.toml`); zero elsewhere. With the
+        commanded gains unchanged, the operator's pitch moment of 60 N m in the crawl leaned the COM
+        back by 42 mm, and the soles tipped; sideways pushes tipped them in 15 of 500 random cases.
+        With the knees' theta soft, the robot withstood a sideways push of only 25 N for 3 s.
 
-        TRACK without tau_coupled uses the same gains. The certified gains are stiff enough to
-        stand, but damp sway by 0.055 only: two pushes of 40 N from the side, 2 s apart, made it
-        fall.
+        TRACK without tau_coupled uses the same gains: the certified gains carry the robot, but damp
+        its sway by only 0.055, and two sideways pushes of 40 N, 2 s apart, made it fall.
         """
         stand = self.stand_gains(module)
         theta = float(kind_of(module) in self.joint_service.hold_stiffens_theta)
@@ -115,8 +113,8 @@ class RobotConfig(Section, frozen=True):
     def support_gains(self, module: str) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return (k_p, k_d) of a module that stiffens because another one is limp.
 
-        The stand gains, except a hip's theta: `joint_service.limp_leg_hip_theta` holds the torso on
-        a leg that is a strut. (phi, theta), N m/rad and N m s/rad.
+        These are the stand gains, except for a hip's theta: `joint_service.limp_leg_hip_theta`
+        holds the torso on a leg that is a strut. (phi, theta), N m/rad and N m s/rad.
         """
         stand = self.stand_gains(module)
         if kind_of(module) != "hip":
@@ -143,14 +141,14 @@ class RobotConfig(Section, frozen=True):
 
     @property
     def leg_weight(self) -> float:
-        """Weight of a leg's knee and ankle, N: its sole bears it, its joints do not lift it."""
+        """Weight of a leg's knee and ankle modules, N: the sole carries it, not the joints."""
         return 2.0 * self.mass.module * GRAVITY
 
 
 def expand(text: str, run_dir: Path) -> str:
     """Return a path or endpoint with `{run}` replaced by the live directory of a run directory.
 
-    Raises BusError for any other text in braces, which would be used as it is.
+    Raises BusError for any other text in braces, which would stay unchanged.
     """
     stray = stray_braces(text, [RUN])
     if stray:

@@ -30,7 +30,7 @@ Shift = tuple[float, float, float, float]
 """A change of x, y (m), roll and yaw (rad)."""
 
 SIGNALS = ("KILL", "STOP", "TERM", "INT")
-"""Signals of a kill; STOP freezes the process instead."""
+"""Signals of a `Kill`; STOP freezes the process."""
 
 
 class Keyframe(Section, frozen=True):
@@ -40,13 +40,13 @@ class Keyframe(Section, frozen=True):
     height: Annotated[float, Range(0.3, 2.0, "m")]
     pitch: Annotated[float, Range(-1.5, 1.5, "rad")] = 0.0
     assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
-    """Weight that the operator rests on the harness and asks the robot to carry, N."""
+    """Weight that the operator rests on the harness and requests the robot to carry, N."""
     shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     """Requested offset of COM x and y, m, and of the torso's roll and yaw, rad."""
     side: ShiftLength | None = None
-    """World y at which the person holds the harness point, m: between two keyframes that set it,
-    and before the first and after the last if that sets it; else it is free. Begin near 0, where
-    the robot stands: nothing eases the grip."""
+    """World y at which the person holds the harness point, m. It applies between two keyframes that
+    set it, and before the first and after the last keyframe if these set it; elsewhere the point is
+    free. Begin near 0, where the robot stands, because the hand grips at once."""
 
 
 class Push(Section, frozen=True):
@@ -60,8 +60,8 @@ class Push(Section, frozen=True):
 class Act(Section, frozen=True):
     """Act of the person besides leading, without a request to the robot.
 
-    rest: puts weight on the harness; relax: the same, and the hand holds with a quarter of its
-    strength; limp: the same, and the hand holds nothing; bump: a blow, half a sine; pull: along x;
+    rest: puts weight on the harness; relax: rests, and the hand has a quarter of its strength;
+    limp: rests, and the hand has no strength; bump: strikes, half a sine; pull: pulls along x;
     tremor: shakes at 6 Hz; let_go: takes the hand off.
     """
 
@@ -73,7 +73,7 @@ class Act(Section, frozen=True):
     ramp: Annotated[float, Range(0.0, 60.0, "s")] = 0.2
     """Rise time, s; not for a bump."""
     release: Annotated[float, Range(0.0, 60.0, "s")] | None = None
-    """Fall time, s; by default as `ramp`."""
+    """Fall time, s; by default equal to `ramp`."""
 
 
 class Kill(Section, frozen=True):
@@ -133,11 +133,13 @@ FAULT_KINDS: Final[Mapping[str, _FaultTraits]] = {
     "encoder_gap": _FaultTraits(
         "an encoder's words have a gap, too short for an error", 0.045, whole=False
     ),
-    "no_ack": _FaultTraits("it sends, but receives and acknowledges nothing", 0.5, whole=True),
-    "bus_full": _FaultTraits(
-        "its bus's send queue is full for 40 ms of each 100 ms (ENOBUFS)", 2.0, whole=True
+    "no_ack": _FaultTraits(
+        "the drive sends, but receives and acknowledges nothing", 0.5, whole=True
     ),
-    "bus_flap": _FaultTraits("its bus is dead for 60 ms of each 150 ms", 2.0, whole=True),
+    "bus_full": _FaultTraits(
+        "the bus's send queue is full for 40 ms of each 100 ms (ENOBUFS)", 2.0, whole=True
+    ),
+    "bus_flap": _FaultTraits("the bus is dead for 60 ms of each 150 ms", 2.0, whole=True),
 }
 """Faults by name. An axis that disarms floats; its sibling keeps its torque."""
 
@@ -151,7 +153,7 @@ class Fault(Section, frozen=True):
     axis: int | None = None
     """Axis 0 or 1 of the ODrive; by default 0. Not for a fault of the whole ODrive."""
     duration: float | None = None
-    """s; by default that of `FAULT_KINDS`. Not for a momentary fault."""
+    """s; by default from `FAULT_KINDS`. Not for a momentary fault."""
 
     @property
     def lasts_s(self) -> float:
@@ -182,7 +184,7 @@ class Scenario(Section, frozen=True):
     duration: Annotated[float, Range(0.1, 86_400.0, "s")]
     keyframe: tuple[Keyframe, ...]
     hand: bool = True
-    """False: the operator lets go; nothing leads."""
+    """False: the operator's hand is off the harness, so nothing leads."""
     push: tuple[Push, ...] = ()
     act: tuple[Act, ...] = ()
     kill: tuple[Kill, ...] = ()
@@ -213,7 +215,10 @@ class Lead(NamedTuple):
 
 
 def lead(scenario: Scenario, t: float) -> Lead:
-    """Return the hand's target at scenario time t, s; before 0, the first keyframe."""
+    """Return the hand's target at scenario time t, s.
+
+    Before the first keyframe and after the last, this is that keyframe.
+    """
     frames = scenario.keyframe
     for a, b in pairwise(frames):
         if frames[0].at < t < b.at:
@@ -244,7 +249,7 @@ def _eased(a: Shift, b: Shift, s: float) -> Shift:
 def _across(
     a: float | None, b: float | None, s: float, s_rate: float
 ) -> tuple[float | None, float]:
-    """Return where the harness point is held sideways, and its rate."""
+    """Return the y at which the harness point is held, None if it is free, and its rate."""
     if a is None or b is None:
         return None, 0.0
     return a + (b - a) * s, (b - a) * s_rate
@@ -260,7 +265,7 @@ def push_at(scenario: Scenario, t: float) -> tuple[float, float, float]:
 
 
 def load(path: Path) -> Scenario:
-    """Read and check a scenario file, or ConfigError."""
+    """Read and check a scenario file; raise ConfigError if it is invalid."""
     scenario = read_toml(path, Scenario)
     check(str(path), scenario)
     return scenario

@@ -29,7 +29,7 @@ class MassConfig(Section, frozen=True):
 
 
 class GeometryConfig(Section, frozen=True):
-    """Lengths, paper Table I."""
+    """Lengths, mostly from paper Table I."""
 
     l1: Length
     l2: Length
@@ -43,7 +43,7 @@ class GeometryConfig(Section, frozen=True):
 
 
 class JointConfig(Section, frozen=True):
-    """The 2-DOF module: motors, gear and differential."""
+    """Motors, gear and differential of every module."""
 
     gear_ratio: Annotated[float, Range(1.0, 200.0, "1")]
     armature: Annotated[float, Range(0.001, 5.0, "kg m^2")]
@@ -52,7 +52,7 @@ class JointConfig(Section, frozen=True):
 
 
 class LimitConfig(Section, frozen=True):
-    """Joint range of one kind of module, with its reason."""
+    """Range of one kind of module; `why` gives the reason."""
 
     phi: tuple[Angle, Angle]
     theta: tuple[Angle, Angle]
@@ -60,7 +60,7 @@ class LimitConfig(Section, frozen=True):
 
 
 class LimitsConfig(Section, frozen=True):
-    """Joint ranges by kind."""
+    """Joint ranges."""
 
     ankle: LimitConfig
     knee: LimitConfig
@@ -74,10 +74,9 @@ class ModuleConfig(Section, frozen=True):
     bus: str
     node_ids: tuple[Annotated[int, Range(0, 62, "1")], Annotated[int, Range(0, 62, "1")]]
     motor_signs: tuple[Literal[-1, 1], Literal[-1, 1]] = (1, 1)
-    """-1: this motor counts against the differential's equations."""
+    """-1: this motor counts backwards."""
     serial_number: str = ""
-    """USB serial number, 12 hexadecimal digits; for the USB driver, `xrl drive` and `xrl
-    doctor`."""
+    """USB serial number, 12 hexadecimal digits; only "odrive_usb" needs it."""
 
 
 LinearStiffness = Annotated[float, Range(0.0, 1e5, "N/m")]
@@ -100,7 +99,7 @@ Stance6 = tuple[StanceLength, StanceLength, StanceLength, StanceAngle, StanceAng
 
 
 class LawConfig(Section, frozen=True):
-    """Gains and choices of the law (docs/law.md)."""
+    """Gains and choices of the law (docs/law.md); order x, y, z, roll, pitch, yaw."""
 
     K_p: Stiffness6
     B_p: Damping6
@@ -111,15 +110,19 @@ class LawConfig(Section, frozen=True):
     jacobian: Literal["load_sharing", "average"]
     split: Literal["certified", "diagonal"]
     local_damping_fraction: Annotated[float, Range(0.0, 1.0, "1")]
+    """For "diagonal" only: fraction of diag(B_q) that joint services apply."""
     load_sharing_moment_arms: tuple[Share, Share, Annotated[float, Range(0.001, 0.5, "m")]]
     recentre_s: Seconds
     lead_easing: Annotated[float, Range(0.0, 0.95, "1")]
+    """alpha: fraction of the hand's force that the planner adds (docs/law.md#harness)."""
     push_integral_s: Annotated[float, Range(0.1, 100.0, "s")] = 1.0
-    """Time in which the force against a lasting push from the side grows by K_p times the error."""
+    """Integration time of the force against a lasting sideways push (docs/law.md#gain-split)."""
     push_integral_max: Annotated[float, Range(0.0, 200.0, "N")] = 0.0
-    """Maximum of that force; HOLD drops it, so the robot must stand the step."""
+    """Maximum of this force, which HOLD drops."""
     shift_max: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     stance_max: Stance6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    """Maximum displacement of the right foot, relative to the left, from [geometry]: x, y, z,
+    rotation vector; 0: not checked. Beyond it the planner does not lead (MISPLACED)."""
     load_correction: tuple[
         Annotated[float, Range(0.0, 50.0, "kg")], Annotated[float, Range(0.0, 100.0, "N m")]
     ] = (0.0, 0.0)
@@ -134,9 +137,11 @@ RequiredStiffness6 = tuple[
 
 
 class CertificateConfig(Section, frozen=True):
-    """Requirements on local gains alone (docs/law.md#gain-split and docs/law.md#certificate)."""
+    """Requirements on the local gains alone (docs/law.md#certificate)."""
 
     K_required: RequiredStiffness6
+    """Stiffness that the local gains alone must reach at every node of the schedule, with and
+    without full assist; order as in [law]."""
     onboard_fraction: Share
     k_q_fraction_max: Annotated[float, Range(0.1, 10.0, "1")]
     margin_min: Share
@@ -144,20 +149,20 @@ class CertificateConfig(Section, frozen=True):
 
 
 class RobustnessConfig(Section, frozen=True):
-    """Model errors with which the loop must be stable (dynamic certificate)."""
+    """Model errors with which the loop must be stable (docs/law.md#flexible-joints)."""
 
     stiffness: tuple[Annotated[float, Range(500.0, 1e6, "N m/rad")], ...]
     """Drivetrain stiffnesses between motor and joint; 1e6 is rigid."""
     damping_s: Annotated[float, Range(0.0, 0.1, "s")]
-    """Drivetrain damping, N m s/rad per N m/rad."""
+    """Damping of a drivetrain, divided by its stiffness."""
     torque_lag_ms: Annotated[float, Range(0.05, 20.0, "ms")]
     """First-order lag of the drives' torque."""
     delay_ms: Annotated[float, Range(1.0, 100.0, "ms")]
     delay_margin: Annotated[float, Range(1.0, 10.0, "1")]
     gain_margin: Annotated[float, Range(1.0, 10.0, "1")]
     drift_max: Annotated[float, Range(0.0, 10.0, "1/s")]
-    """Maximum growth rate of a motion without oscillation along a led direction: the weight's
-    feedforward follows the motor, where the encoder is, not the joint."""
+    """Maximum growth rate of a drift along a led direction."""
+    # the weight's feedforward follows the encoder on the motor, not the joint, so the robot drifts
     hands: tuple[
         tuple[
             Annotated[float, Range(0.0, 1e5, "N/m")],
@@ -167,7 +172,7 @@ class RobustnessConfig(Section, frozen=True):
         ],
         ...,
     ]
-    """(k_z, b_z, k_pitch, b_pitch) of hands at the harness, lightest first."""
+    """(k_z, b_z, k_pitch, b_pitch) of each hand at the harness."""
 
 
 class AssistConfig(Section, frozen=True):
@@ -187,7 +192,7 @@ StillTime = Annotated[float, Range(0.1, 5.0, "s")]
 
 
 class WearerThresholds(Section, frozen=True):
-    """A person's thresholds of park, all of them; `xrl log wearer` measures them."""
+    """All thresholds of park for one person, which `xrl log wearer` measures."""
 
     open_n: OpenForce
     open_back_nm: OpenMoment
@@ -195,7 +200,7 @@ class WearerThresholds(Section, frozen=True):
 
 
 class ParkConfig(Section, frozen=True):
-    """Parking: a person may rest on a crouched robot that stands still (docs/law.md#park)."""
+    """A person may rest on a robot that stands still in a working pose (docs/law.md#park)."""
 
     enabled: bool = False
     open_n: OpenForce = 22.0
@@ -234,6 +239,8 @@ class JointServiceConfig(Section, frozen=True):
 
     driver: Literal["odrive_can", "odrive_usb"]
     loop: Literal["onboard", "service"]
+    """With "service" drives get torques only, and a module goes limp with its service
+    (docs/drives.md#the-drives-own-loop)."""
     rate_hz: Rate
     state_rate_hz: Rate
     max_command_age_ms: Milliseconds
@@ -247,7 +254,9 @@ class JointServiceConfig(Section, frozen=True):
     damp_k_d: LocalDamping
     damp_knee_stop: Angle
     hold_stiffens_theta: tuple[Literal["ankle", "knee", "hip"], ...]
+    """In HOLD every phi, and the theta of these, rises to its stand gains."""
     damp_sinks: tuple[Literal["ankle", "knee", "hip"], ...]
+    """In DAMP the theta of these sinks, and every phi holds."""
     torque_rate_max: Annotated[float, Range(100.0, 1e6, "N m/s")]
     soft_stop_k_p: LocalStiffness
     k_p_max: LocalStiffness
@@ -256,34 +265,32 @@ class JointServiceConfig(Section, frozen=True):
     pendant_ms: Annotated[float, Range(20.0, 10_000.0, "ms")] = 500.0
     fallen_k_d: LocalDamping = 20.0
     limp_leg_hip_theta: AxisGains = AxisGains(k_p=2700.0, k_d=42.0)
-    """Gains of the hips' theta while a knee is limp and its leg stands as a strut."""
+    """Gains of the hips' theta while a knee is limp and its leg stands as a strut; optional."""
     stiffen_ms: Milliseconds = 300.0
-    """Rise time of the gains in HOLD and beside a limp module. At 300 ms a led robot, leaned on
-    from the side, fell at 10 N less."""
+    """Rise time of the gains in HOLD and beside a limp module."""
+    # at 300 ms a led robot fell under a sideways lean that was 10 N smaller
 
 
 class EnvelopeConfig(Section, frozen=True):
-    """Envelope of accepted commands, beyond `GainSchedule.bounds`."""
+    """Limits of accepted commands, in addition to the gain schedule's bounds."""
 
     tau_ff_margin: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
     q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
     q_ref_astray: Annotated[float, Range(0.001, 2.0, "rad")] = 0.04
-    """Maximum deviation of an ankle's reference from its rate, within half a second. The law's: 0.3
-    mrad while a person leads, 20 mrad while the height follows its own reference."""
+    """Maximum motion of an ankle's reference that its rate does not explain, within half a second
+    (docs/results.md#wrong-planners)."""
     spring_torque: Annotated[float, Range(1.0, 1e3, "N m")] = 40.0
     hold_torque: Annotated[float, Range(1.0, 1e4, "N m")] = 300.0
     tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
     coupled_work: Annotated[float, Range(0.01, 1e3, "J")] = 1.0
-    """Maximum work of the coupled torque against the joint's way to its reference. The law's: 0.1 J
-    on drawn plants pushed as hard as soles and motors bear, 0.6 J in a fall."""
+    """Maximum of coupled torque times deflection, if the torque points away from the reference."""
+    # the law's own: 0.1 J on plants pushed as hard as soles and motors withstand, 0.6 J in a fall
     coupled_energy: Annotated[float, Range(0.01, 1e3, "J")] = 10.0
-    """Maximum work of the coupled torque on a module's moving joints within about 0.3 s. The law's:
-    2 J on drawn plants pushed with 75 % of what soles and motors bear, 6 J when a hand of 150 N
-    leads up."""
+    """Maximum work of the coupled torque on moving joints within about 0.3 s
+    (docs/results.md#wrong-planners)."""
     dtau_ff: Annotated[float, Range(1.0, 1e5, "N m/s")] = 300.0
     v_ref: Annotated[float, Range(0.1, 100.0, "rad/s")] = 6.0
-    """Maximum rate of the reference where a pose's own bound is larger: nearly straight knees turn
-    fast."""
+    """Maximum rate of a reference; caps the larger bounds of nearly straight knees."""
     torque_step: Annotated[float, Range(0.0, 100.0, "N m")] = 1.0
     torque_rate: Annotated[float, Range(1.0, 1e5, "N m/s")] = 1000.0
 
@@ -291,14 +298,14 @@ class EnvelopeConfig(Section, frozen=True):
 class TripLimit(Section, frozen=True):
     """Limit of one trip."""
 
-    limit: Annotated[float, Range(0.0, 1e4, "the trip's own unit")]
+    limit: Annotated[float, Range(0.0, 1e4, "(unit of the trip)")]
     """Value beyond which it trips."""
     after_ms: Annotated[float, Range(0.0, 1e4, "ms")] = 0.0
-    """Time continuously beyond the limit before it trips."""
+    """Time beyond the limit before it trips."""
 
 
 class TripsConfig(Section, frozen=True):
-    """Limits beyond which the robot holds and is no longer led (docs/reference/faults.md)."""
+    """Limits beyond which the robot holds and is not led; `xrl faults` lists them."""
 
     shaking: TripLimit = TripLimit(limit=15.0)
     torque_limit: TripLimit = TripLimit(limit=1.0, after_ms=1000.0)
@@ -321,24 +328,23 @@ Celsius = Annotated[float, Range(-40.0, 200.0, "C")]
 
 
 class HeatConfig(Section, frozen=True):
-    """Thermal model of motors and output stages (docs/results.md)."""
+    """Thermal model of motors and output stages (docs/law.md#heat)."""
 
     estimate: bool = False
-    """False: no temperature is estimated, and the robot does not stand up for heat."""
+    """False: no temperatures are estimated."""
     ambient: Celsius = 40.0
     winding_max: Celsius = 95.0
-    """Maximum winding temperature: below the insulation class by the estimate's error, and 5 C
-    below the `temp_limit_lower` of a motor thermistor. Standing up against a clinging hand adds 2
-    C."""
+    """Set it below the insulation class by the estimate's error, and 5 C below the
+    `temp_limit_lower` of a motor thermistor. Standing up against a clinging hand adds 2 C."""
     stage_max: Celsius = 90.0
-    """Maximum output stage temperature, below the drives' `temp_limit_lower`."""
+    """Output stages; set it below the drives' `temp_limit_lower`."""
     resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = 0.1
     winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
     winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5
     housing_capacity: Annotated[float, Range(1.0, 1e5, "J/K")] = 1500.0
     housing_to_air: Annotated[float, Range(0.01, 50.0, "K/W")] = 1.2
     stage_per_square_ampere: Annotated[float, Range(0.0, 1.0, "K/A^2")] = 0.054
-    """Rise of an output stage with the square of its current."""
+    """Temperature rise of an output stage per squared current."""
     stage_s: Annotated[float, Range(1.0, 1e4, "s")] = 200.0
     """Time constant of the output stages."""
     ease_s: Annotated[float, Range(5.0, 600.0, "s")] = 60.0
@@ -371,38 +377,38 @@ class HarnessConfig(Section, frozen=True):
 
 
 class ImuConfig(Section, frozen=True):
-    """IMU on the torso, for floors that slope (docs/law.md#slopes)."""
+    """IMU on the torso, for sloping floors (docs/law.md#slopes)."""
 
     fitted: bool = False
-    """True if fitted; without an IMU the floor counts as level."""
+    """False: the floor counts as level."""
     bus: str = "imu"
     rate_hz: Rate = 100.0
-    """Rate of samples and of the service's cycles."""
+    """Rate of samples and cycles."""
     mounting: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
-    """Roll, pitch and yaw of the sensor on the torso: R = Rz(yaw) Rx(roll) Ry(pitch)."""
+    """Roll, pitch and yaw of the sensor: R = Rz(yaw) Rx(roll) Ry(pitch)."""
     stale_ms: Milliseconds = 100.0
     levelling_s: Annotated[float, Range(0.05, 60.0, "s")] = 1.0
 
 
 class Ros2Config(Section, frozen=True):
-    """Gateway process that publishes to ROS 2; rate 0: not published (docs/ros2.md)."""
+    """Gateway to ROS 2, with its topics' rates; 0: not published (docs/ros2.md)."""
 
     router: str = "tcp/localhost:7447"
     """Zenoh router of the ROS 2 network (`rmw_zenohd`)."""
     distribution: str = "jazzy"
-    """Its distribution: jazzy, kilted or lyrical."""
+    """jazzy, kilted or lyrical"""
     namespace: str = ""
     """Namespace of the topics and prefix of the frame names, such as `legs`."""
     joint_states_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
-    """Rate of `joint_states`."""
+    """`joint_states`"""
     tf_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 30.0
-    """Rate of `/tf`."""
+    """`/tf`"""
     wrench_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
-    """Rate of `harness/wrench`."""
+    """`harness/wrench`"""
     diagnostics_hz: Annotated[float, Range(0.0, 10.0, "Hz")] = 1.0
-    """Rate of `/diagnostics`."""
+    """`/diagnostics`"""
     clock_hz: Annotated[float, Range(0.0, 250.0, "Hz")] = 50.0
-    """Rate of `/clock`, for a simulated robot only."""
+    """`/clock`, of a simulated robot only"""
 
 
 SupplyVoltage = Annotated[float, Range(0.0, 100.0, "V")]
@@ -413,14 +419,13 @@ class SupplyConfig(Section, frozen=True):
 
     low_v: SupplyVoltage = 0.0
     sit_v: SupplyVoltage = 0.0
-    """Below it a led robot goes down on its own, if its supply was once above `low_v`. Set it well
-    above the drives' `config.dc_bus_undervoltage_trip_level` and above the battery's own
-    cut-off."""
+    """Below it a led robot goes down to its lowest pose, if its supply was once above `low_v`. Set
+    it well above the drives' `config.dc_bus_undervoltage_trip_level` and the battery's cut-off."""
 
 
 LOST_S: Final = 0.1
-"""Silence after which a drive without a watchdog is lost, s. In DAMP a knee holds beside any module
-of its host that was silent for this time, whatever the watchdog (`services.joint.neighbours`)."""
+"""Silence after which a drive without a watchdog is lost, s. In DAMP a knee holds if any module of
+its host was silent for this time, even with a watchdog (`services.joint.neighbours`)."""
 
 
 class DriveConfig(Section, frozen=True):
@@ -435,20 +440,20 @@ class DriveConfig(Section, frozen=True):
     heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
     zero_mark_turns: Annotated[float, Range(0.0, 4096.0, "turns")]
     encoder_bandwidth: Annotated[float, Range(100.0, 8000.0, "rad/s")] = 2000.0
-    """Bandwidth of the drives' position and velocity estimate."""
+    """Bandwidth of the drives' position and velocity estimates."""
 
     @property
     def lost_after_s(self) -> float:
         """Silence after which a drive is lost, s.
 
-        At least its watchdog's timeout: until then a silent drive holds its last torque and can
-        come back unharmed, while a FAULT is permanent.
+        With a watchdog this is its timeout: until then a silent drive holds its last torque and may
+        answer again, while FAULT ends only with a restart.
         """
         return self.watchdog_timeout or LOST_S
 
 
 class CanConfig(Section, frozen=True):
-    """CAN bus in python-can's terms."""
+    """CAN bus `[can.NAME]`, in python-can's terms."""
 
     interface: str
     channel: str
@@ -458,12 +463,12 @@ class BusSecurityConfig(Section, frozen=True):
     """Access to the bus (docs/security.md)."""
 
     mode: Literal["local", "mtls", "open"] = "local"
-    """local: UNIX sockets of this user; mtls: TLS with certificates on both sides; open: anyone who
-    reaches a port."""
+    """local: this user's UNIX sockets; mtls: TLS with certificates on both sides; open: TCP for
+    anyone who reaches a port."""
     keys: str = "~/.config/xrl/{robot}/keys"
-    """Folder of this host's certificates and keys for `mtls`; `xrl keys pack` fills it."""
+    """For `mtls`: this host's certificates and keys, packed by `xrl keys pack`."""
     allow: tuple[str, ...] = ()
-    """For `mtls`: hosts that may link besides those of the endpoints, such as laptops."""
+    """For `mtls`: IP addresses of further hosts that may link, such as laptops."""
 
 
 class BusConfig(Section, frozen=True):
@@ -486,7 +491,7 @@ class RecorderConfig(Section, frozen=True):
 
 
 class OperatorConfig(Section, frozen=True):
-    """The simulated operator's hand: a clipped spring-damper (docs/simulator.md)."""
+    """The simulated hand: a clipped spring-damper (docs/simulator.md#reference-scenario)."""
 
     k_z: Annotated[float, Range(0.0, 1e5, "N/m")]
     b_z: Annotated[float, Range(0.0, 1e4, "N s/m")]
@@ -497,7 +502,7 @@ class OperatorConfig(Section, frozen=True):
     k_y: Annotated[float, Range(0.0, 1e5, "N/m")] = 1500.0
     b_y: Annotated[float, Range(0.0, 1e4, "N s/m")] = 150.0
     soft_n: Annotated[float, Range(0.0, 1e4, "N")] = 0.0
-    """Maximum spring force along z of a harness that softens; 0: linear."""
+    """Maximum spring force along z of a softening harness; 0: linear."""
 
 
 class SimulationConfig(Section, frozen=True):
@@ -512,4 +517,4 @@ class SimulationConfig(Section, frozen=True):
     late_slip_ms: Milliseconds
     operator: OperatorConfig
     can_dialect: Literal["0.5", "0.6"] = "0.5"
-    """Firmware whose CANSimple the emulated drives speak; the services detect it."""
+    """Firmware version whose CANSimple the emulated drives use."""

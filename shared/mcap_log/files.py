@@ -22,7 +22,7 @@ RECOVERED: Final = ".recovered" + SUFFIX
 
 
 def free_stem(directory: Path) -> str:
-    """Return the first of run, run-1, ... without a file: no file is ever replaced."""
+    """Return the first of run, run-1, ... without a file, so that no file is replaced."""
     stem = first = FIRST.removesuffix(SUFFIX)
     number = 0
     while any(directory.glob(f"{stem}.*mcap")) or any(directory.glob(f"{stem}_*{SUFFIX}")):
@@ -32,7 +32,7 @@ def free_stem(directory: Path) -> str:
 
 
 def create(directory: Path, stem: str, number: int) -> tuple[Path, BinaryIO]:
-    """Create and lock a run's file of some number, from 0; OSError if it cannot be made."""
+    """Create and lock file `number` (from 0) of a run; raise OSError if it cannot be created."""
     path = directory / (f"{stem}_{number}{SUFFIX}" if number else f"{stem}{SUFFIX}")
     file = path.open("xb")
     with contextlib.suppress(OSError):  # a file system without locks
@@ -41,12 +41,12 @@ def create(directory: Path, stem: str, number: int) -> tuple[Path, BinaryIO]:
 
 
 def recovered_name(path: Path) -> Path:
-    """Return where a recovered file goes by default: `run.recovered.mcap` beside it."""
+    """Return the default path of a recovered file: `run.recovered.mcap` beside it."""
     return path.with_name(path.name.removesuffix(SUFFIX) + RECOVERED)
 
 
 def in_use(path: Path) -> bool:
-    """Return True if a live recorder is writing a file; False if it cannot be opened."""
+    """Return True if a live recorder is writing a file; False also if the file cannot be opened."""
     try:
         with locked(path) as acquired:
             return not acquired
@@ -56,9 +56,9 @@ def in_use(path: Path) -> bool:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[bool]:
-    """Hold the lock of a file; yield False if another process has it.
+    """Hold the lock of a file and yield True; yield False if another process has the lock.
 
-    Raises OSError if it cannot be opened.
+    Raises OSError if the file cannot be opened.
     """
     with path.open("rb") as file:
         free = True
@@ -75,8 +75,8 @@ class FsyncThread:
     """Thread that syncs files to the disk; the first request starts it.
 
     A disk under load answers an fsync late: 0.1 s was measured on a machine with four busy
-    processes, and memory cards take seconds. In the recorder's loop that wait would make the
-    reception times of messages late.
+    processes, and memory cards take seconds. In the recorder's loop this wait would make
+    the messages' reception times late.
     """
 
     def __init__(self) -> None:
@@ -91,8 +91,9 @@ class FsyncThread:
     def request(self, descriptor: int, *, last: bool = False) -> None:
         """Request the sync of a file, which may be closed after this, and return at once.
 
-        A request is skipped while another one waits, which covers both, unless it is the `last` of
-        this file. Raises OSError if an earlier sync failed: written data may not be on the disk.
+        A request is skipped while another one waits, whose sync covers both, unless it is the
+        `last` of this file. Raises OSError if an earlier sync failed: written data may not be on
+        the disk.
         """
         with self._wake:
             self._raise()
@@ -105,7 +106,7 @@ class FsyncThread:
             self._wake.notify_all()
 
     def settle(self) -> None:
-        """Wait until nothing is left to sync; OSError if a sync failed."""
+        """Wait until nothing is left to sync; raise OSError if a sync failed."""
         with self._wake:
             self._wake.wait_for(lambda: not self._waiting and not self._busy)
             self._raise()

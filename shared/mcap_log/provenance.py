@@ -1,4 +1,4 @@
-"""Origin of a run: packages and machine; `shared.revision` has the commit. Written first.
+"""Origin of a run: packages and machine; `shared.revision` has the commit.
 
 Two runs can be expected to agree bit by bit only if these agree: OpenBLAS picks its kernels by CPU
 and thread count (docs/logs.md).
@@ -27,7 +27,7 @@ THREAD_VARIABLES: Final = (
 
 
 def machine() -> dict[str, str]:
-    """Return Python, platform, processor, C library and the thread environment (JSON)."""
+    """Return Python's version, the platform, processor, C library and `THREAD_VARIABLES` (JSON)."""
     threads = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
     return {
         "python": platform.python_version(),
@@ -50,9 +50,10 @@ def packages() -> dict[str, str]:
 
 
 def cpu_model(cpuinfo: Path) -> str:
-    """Return the CPU's name as Linux gives it, or the platform module's.
+    """Return the CPU's name as Linux reports it, or else as the `platform` module does.
 
-    On Arm Linux gives numbers: the makers and parts of the cores, each once.
+    On Arm, Linux reports only numbers: the maker and the part of each core. Each pair is returned
+    once.
     """
     try:
         lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()

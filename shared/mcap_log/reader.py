@@ -1,9 +1,9 @@
 """Read an MCAP file that is finished, cut off anywhere, or damaged.
 
 The reader yields every whole record in the order of the file. Consecutive messages outside of
-chunks come as one record, like those of a chunk. Private records, and kinds that the format does
-not define yet, are skipped. If the file ends inside a chunk, the readable messages at its start are
-yielded. After damage, reading continues at the next valid chunk.
+chunks are yielded as one record, like those of a chunk. Private records, and kinds that the format
+does not define, are yielded without content. If the file ends inside a chunk, the readable messages
+at its start are yielded. After damage, reading continues at the next valid chunk.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ _CHUNK_MARKS: Final = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4")
 _MARK_AT: Final = PREFIX.size + CHUNK_TIMES.size
 """Offset of a chunk's compression from its start."""
 IN_LINE_NS: Final = 10 * NS_PER_S
-"""Maximum length of a chunk, and distance from the one before, whose times are trusted. A recorder
-flushes four times a second."""
+"""Maximum duration of a chunk, and maximum distance from the chunk before it, for its times to be
+trusted. A recorder flushes four times a second."""
 _INDEX_HEAD: Final = struct.Struct("<HI")  # of a message index: channel, size of its entries
 _ENTRY: Final = struct.Struct("<QQ")  # of a message index: log time, offset in the chunk
 _DEFINITIONS: Final = (Opcode.SCHEMA, Opcode.CHANNEL)
@@ -60,7 +60,7 @@ LOOSE_MAX: Final = 1 << 20
 """Size of the pieces in which messages outside of chunks are yielded and copied, bytes."""
 
 EXPANDED_MIN: Final = 1 << 28
-"""Bytes to which any file may expand."""
+"""Size to which even the smallest file may expand, bytes."""
 
 
 class LostBytes(msgspec.Struct, frozen=True):
@@ -72,7 +72,7 @@ class LostBytes(msgspec.Struct, frozen=True):
     last_ns: int = 0
     """Log times; 0: unknown."""
     missing: int | None = None
-    """Messages lost from a chunk that can be read in part; None: nothing can be read."""
+    """Number of messages missing from a damaged chunk that is readable in part; None: unknown."""
 
 
 class LogRecord(NamedTuple):
@@ -87,21 +87,21 @@ class LogRecord(NamedTuple):
     value: McapRecord | None = None
     """The record decoded; None for a message or an index."""
     rows: Sequence[ChunkMessage] = ()
-    """The messages: `body[row.start:row.end]` is the payload of one."""
+    """The messages: `body[row.start:row.end]` is the payload of each."""
     definitions: Sequence[LogRecord] = ()
     """Schemas and channels inside the chunk."""
     lost: LostBytes | None = None
     """Missing part of a chunk that can be read in part."""
 
     def values(self) -> Iterator[McapRecord]:
-        """Yield the decoded record and those inside the chunk."""
+        """Yield the decoded record, and those decoded inside a chunk."""
         for record in (self, *self.definitions):
             if record.value is not None:
                 yield record.value
 
 
 class ChunkPlace(NamedTuple):
-    """A chunk that was found but not opened, or messages outside of chunks."""
+    """Location of a chunk, or of messages outside of chunks, for `LogReader.read_at`."""
 
     start: int
     """Offset of its record in the file."""
@@ -113,28 +113,28 @@ class ChunkPlace(NamedTuple):
 
 
 class LogReader:
-    """Reader of one file. Iterate over it once; then `cut` and `damage` hold what was lost.
+    """Reader of one file. Iterate over it once; then `cut` and `damage` list the losses.
 
-    Or `skim` it, and `read_at` the places that are needed.
+    Alternatively call `skim`, then `read_at` for the places that are needed.
     """
 
     def __init__(self, data: bytes | mmap.mmap) -> None:
         self._data = data
         self.size = len(data)
         self.finished = False
-        """The recorder wrote the end of the file."""
+        """True if the recorder wrote the end of the file."""
         self.cut: LostBytes | None = None
-        """Bytes behind the last whole record of an unfinished file."""
+        """Bytes after the last whole record of an unfinished file."""
         self.damage: list[LostBytes] = []
         """Places in the middle that could not be read."""
         self.passed_over = 0
-        """Records of unknown kinds."""
+        """Number of records of unknown kinds."""
         self.earlier_ends = 0
-        """Ends of the file with more data behind them: its writer finished it more than once."""
+        """Number of ends with more data after them: the writer finished the file more than once."""
         self.in_summary: Counter[int] = Counter()
-        """Records of the summary, by opcode."""
+        """Number of records in the summary, by opcode."""
         self.message_count: int | None = None
-        """Messages that the summary's statistics count; None if these are missing or damaged."""
+        """Number of messages by the summary's statistics; None if these are missing or damaged."""
         self._encodings: dict[int, str] = {}
         self._vouched = 0
         """Offset up to which records of unknown kinds are known to lead to a known one."""
@@ -162,11 +162,11 @@ class LogReader:
                 yield record
 
     def skim(self) -> Iterator[LogRecord | ChunkPlace]:
-        """Yield what iteration does, but places instead of messages.
+        """Yield the same records as iteration, but places instead of messages.
 
-        Only the heads of chunks are read: damage within a chunk shows when it is read. No CRC
-        covers the times in a head. So a chunk with times out of line is opened for those of its
-        messages, and so is a chunk with channels that no record before it described.
+        Only the heads of chunks are read, so damage within a chunk is found only by `read_at`. No
+        CRC covers the times in a head. So a chunk with implausible times is opened to read its
+        messages' times. A chunk with channels that no earlier record described is opened, too.
         """
         yield from self._summary()
         described = bool(self._encodings)
@@ -203,15 +203,15 @@ class LogReader:
     def read_at(self, start: int) -> LogRecord | None:
         """Return the record at a place that `skim` found; None if it is damaged.
 
-        Raises RunError if what was read so far is far larger than any run of that size.
+        Raises RunError if all records read so far are far larger than in any run of this file size.
         """
         damage, self.damage = self.damage, []
         record, _ = self._next(start)
         self._expanded += len(record.body) if record is not None else 0
         if self._expanded > max(EXPANDED_MIN, EXPANSION_MAX * self.size):
             raise RunError(
-                f"its {self.size >> 10} KiB expand to over {self._expanded >> 20} MiB: this is "
-                "not a log of this project"
+                f"its content of {self.size >> 10} KiB expands to over {self._expanded >> 20} MiB: "
+                "this is not a log of this project"
             )
         self.damage = damage + [loss for loss in self.damage if loss not in damage]
         if record is not None:
@@ -219,7 +219,7 @@ class LogReader:
         return record
 
     def _place(self, at: int) -> tuple[ChunkPlace | None, int]:
-        """Return a chunk's place and the offset behind its indices; None for other records."""
+        """Return a chunk's place and the offset after its indices; None for other records."""
         opcode, start, following = self._extent(at)
         if opcode != Opcode.CHUNK or not start + CHUNK_TIMES.size <= following <= self._end:
             return None, at
@@ -237,7 +237,7 @@ class LogReader:
         return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
 
     def _indices(self, at: int) -> Iterator[tuple[int, bytes, int]]:
-        """Yield each message index from a place on: its channel, its entries, where it ends."""
+        """Yield each message index from a place on: its channel, its entries, its end."""
         while True:
             opcode, start, end = self._extent(at)
             start += _INDEX_HEAD.size
@@ -264,7 +264,7 @@ class LogReader:
         try:
             record = self._record(opcode, at, start, end)
         except Malformed:
-            # Either its content is wrong, or its length: then no record follows it.
+            # Its content is wrong, or its length. If its length is wrong, no record follows it.
             following = end if self._plausible(end) else self._chunk_after(at + 1)
             return None, self._lost(at, following, *_times(self._data[start:end], opcode))
         if record.lost is not None:
@@ -272,7 +272,7 @@ class LogReader:
         return record, record.end
 
     def _record(self, opcode: int, at: int, start: int, end: int) -> LogRecord:
-        # an index of messages follows a chunk only: anything else there is a damaged one
+        # a message index follows only a chunk: any other record before an index is a damaged chunk
         index_follows = self._extent(end)[0] == Opcode.MESSAGE_INDEX
         if opcode == Opcode.MESSAGE:
             rows, end = split_messages(self._data, at, self._end, enough=LOOSE_MAX, origin=at)
@@ -292,7 +292,7 @@ class LogReader:
             value, size = decode(opcode, body)
             record = LogRecord(opcode, at, end, body, value)
         if size < len(body) and not self._leads_on(end):
-            raise Malformed  # no later version's field: the length is wrong
+            raise Malformed  # not a field of a later version: the length is wrong
         return record
 
     def _opened(self, at: int, end: int, chunk: Chunk) -> LogRecord:
@@ -305,7 +305,7 @@ class LogReader:
         indices = [entries for _, entries, _ in self._indices(end)]
         counted = sum(len(entries) // _ENTRY.size for entries in indices)
         if not whole and (places := _places(content, indices)):
-            # The next record may begin within an incomplete one: only the indices say where.
+            # The next record may begin within an incomplete one: only the indices give its offset.
             others = split_chunk(content, places).others
             found = [split_messages(content, place, len(content), enough=1) for place in places]
             rows = [row for messages, _ in found for row in messages]
@@ -318,10 +318,11 @@ class LogReader:
         return LogRecord(Opcode.CHUNK, at, end, content, chunk, rows, definitions, lost)
 
     def _behind_data_end(self, at: int) -> int:
-        """Return where to continue after a data end: where the data ends, unless more follows.
+        """Return the offset at which to continue after a data end record.
 
-        A writer that finished and then accepted further messages has written its first summary,
-        footer and magic in the middle of the file, or less if finishing failed.
+        This is the end of the data, unless more follows. A writer that finished and then accepted
+        further messages has written its first summary, footer and magic in the middle of the file,
+        or only a part of them if finishing failed.
         """
         if at >= self._end:
             return at
@@ -341,7 +342,7 @@ class LogReader:
         return following
 
     def _leads_on(self, at: int) -> bool:
-        """Return True if a known record follows here, maybe behind unknown ones, or the data ends.
+        """Return True if a known record follows, possibly after unknown ones, or the data ends.
 
         A record that is only skipped has no other proof of its length.
         """
@@ -398,7 +399,7 @@ class LogReader:
                 self._encodings[value.id] = value.message_encoding
 
     def _lost(self, start: int, following: int | None, first_ns: int = 0, last_ns: int = 0) -> int:
-        """Record that bytes are lost, up to the next readable ones; return where those are."""
+        """Record a loss of bytes up to the next readable ones; return the offset of those."""
         end = self._end if following is None else following
         loss = LostBytes(start, end, first_ns, last_ns)
         if end < self._end or self.finished:
@@ -441,7 +442,7 @@ class LogReader:
             at += 1
 
     def _find_summary(self) -> int:
-        """Look for the end of a finished file; return where its summary starts."""
+        """Look for the end of a finished file; return the offset of its summary, else 0."""
         tail = self._data[max(0, self.size - _TAIL) : self.size]
         if len(tail) < _TAIL or not tail.endswith(MAGIC):
             return 0
@@ -456,7 +457,7 @@ class LogReader:
         (crc,) = CRC.unpack_from(tail, PREFIX.size + _FOOTER_LENGTH - CRC.size)
         vouched = self._data[start : self.size - len(MAGIC) - CRC.size]
         self._sound = crc in (0, zlib.crc32(vouched))
-        if self._sound:  # else no data end is known, and what follows the data shows as damage
+        if self._sound:  # else the data's end is unknown, and bytes after it show as damage
             self._end = start
         return start
 
@@ -489,7 +490,7 @@ def _definitions(records: Sequence[tuple[int, bytes]]) -> tuple[LogRecord, ...]:
 
 
 def _places(content: bytes, indices: Sequence[bytes]) -> list[int]:
-    """Return the offsets at which a chunk has the messages of its indices."""
+    """Return the offsets of the messages that a chunk's indices list."""
     found = []
     for entries in indices:
         for log_ns, at in _ENTRY.iter_unpack(entries[: len(entries) // _ENTRY.size * _ENTRY.size]):
@@ -519,7 +520,7 @@ def _times(body: bytes, opcode: int) -> tuple[int, int]:
 
 @contextlib.contextmanager
 def open_log(path: Path) -> Iterator[LogReader]:
-    """Open a file to read what can be read of it.
+    """Open a file and yield a reader of its readable parts.
 
     Raises RunError for a missing or empty file, a directory, a pipe, and a file that is not MCAP.
     """
@@ -534,11 +535,11 @@ def open_log(path: Path) -> Iterator[LogReader]:
                 raise RunError(f"{path}: cannot be read: not a regular file; give an MCAP file")
             file = stack.enter_context(path.open("rb"))
             if not os.fstat(file.fileno()).st_size:
-                raise RunError(f"{path}: is empty; give an MCAP file")
+                raise RunError(f"{path}: empty file; give an MCAP file")
             data = stack.enter_context(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
         except OSError as error:
             found = f"cannot be read: {error.strerror}"
             raise RunError(f"{path}: {found}; give an MCAP file") from None
         if data[: len(MAGIC)] != MAGIC:
-            raise RunError(f"{path}: is not an MCAP file (wrong first bytes)")
+            raise RunError(f"{path}: wrong first bytes; give an MCAP file")
         yield LogReader(data)

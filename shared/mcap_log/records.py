@@ -1,9 +1,9 @@
-"""Encode MCAP records, and decode them without trusting any of them. Pure.
+"""Encode MCAP records, and decode them without trusting them. Pure.
 
 The records are the classes of the mcap package. Its own readers trust each length: a wrong one
 makes them read on, allocate or raise (docs/logs.md). Here a record is valid only if its fields fit
-into its length; everything else is `Malformed`. Bytes behind the last field belong to a later
-version, and the format lets a reader skip them.
+into its length; every other record is `Malformed`. Bytes after the last field belong to a later
+version of the format, which lets a reader skip them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mcap.records import (
 )
 
 __all__ = ["Attachment", "Channel", "Chunk", "Header", "McapRecord", "Metadata", "Schema"]
-"""The mcap package's classes that `decode` returns."""
+"""Classes of the mcap package, for importers of this module."""
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
@@ -52,7 +52,8 @@ ZSTD_LEVEL: Final = 1
 """JSON rows with measured doubles are smaller at level 1 than at any level up to 12. At the default
 level 3 a run is 6 % larger and takes twice the time (findings/zstd_level_of_json_rows.sh)."""
 DECOMPRESSED_MAX: Final = 1 << 26
-"""Maximum size of a chunk, unless its bytes can hold more: a flipped bit claims exabytes."""
+"""Maximum decompressed size of a chunk, bytes, unless its compressed size allows more: a flipped
+bit can claim exabytes."""
 EXPANSION_MAX: Final = 50
 """Maximum expansion of compressed bytes; a run's chunks expand four to ten times."""
 _WINDOW_MAX: Final = 1 << 27
@@ -98,12 +99,12 @@ def encode(record: McapRecord) -> bytes:
 
 
 def with_prefix(opcode: int, body: bytes) -> bytes:
-    """Return a record's bytes from its content."""
+    """Return a record's bytes: opcode, length and content."""
     return PREFIX.pack(opcode, len(body)) + body
 
 
 def compressed_chunk(first_ns: int, last_ns: int, content: bytes) -> Chunk:
-    """Return a zstd chunk of these records, with its messages' first and last log time."""
+    """Return a zstd chunk of these records, with its messages' first and last log times."""
     return Chunk(
         compression="zstd",
         data=zstandard.compress(content, ZSTD_LEVEL),
@@ -117,7 +118,7 @@ def compressed_chunk(first_ns: int, last_ns: int, content: bytes) -> Chunk:
 def message_index(channel_id: int, rows: Iterable[tuple[int, int]]) -> bytes:
     """Return the index record of a channel's messages in their chunk.
 
-    `rows` have log time and offset in the decompressed chunk of each message.
+    `rows` has each message's log time, and its offset in the decompressed chunk.
     """
     entries = b"".join(struct.pack("<QQ", *row) for row in rows)
     return with_prefix(Opcode.MESSAGE_INDEX, struct.pack("<HI", channel_id, len(entries)) + entries)
@@ -151,9 +152,9 @@ def file_end(position: int, groups: Mapping[int, bytes]) -> bytes:
 def decode(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
     """Decode a record of the data section that is neither chunk nor message.
 
-    Returns the record, None for a message index, of which only the length is checked; and the size
-    of its fields, which a later version's may follow. Raises Malformed if the content does not fit
-    the opcode or the length, or its CRC is wrong.
+    Returns the record (None for a message index, of which only the length is checked) and the size
+    of its fields; fields of a later version may follow. Raises Malformed if the content does not
+    fit the opcode or the length, or its CRC is wrong.
     """
     if opcode == Opcode.MESSAGE_INDEX:
         size = 6 + int.from_bytes(body[2:6], "little")
@@ -178,10 +179,10 @@ def decode(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
 
 
 def decode_chunk(body: bytes, *, cut: bool = False) -> tuple[Chunk, int]:
-    """Decode a chunk's head; its data stays compressed. Return it, and the size of its fields.
+    """Decode a chunk, whose data stays compressed. Return it, and the size of its fields.
 
-    `cut`: the file ends inside the chunk, so `data` is only its start. Else raises Malformed if the
-    data is shorter than the head says.
+    `cut`: the file ends inside the chunk, so its data is incomplete. Raises Malformed if the head
+    is invalid or, without `cut`, the data is incomplete.
     """
     fields = _Fields(body)
     first_ns, last_ns, size, crc = CHUNK_TIMES.unpack(fields.read(CHUNK_TIMES.size))
@@ -205,9 +206,9 @@ def decode_chunk(body: bytes, *, cut: bool = False) -> tuple[Chunk, int]:
 
 
 def decompressed(chunk: Chunk) -> bytes:
-    """Return a chunk's records.
+    """Return a chunk's records, decompressed.
 
-    Raises Malformed if size or CRC differ from those in the head, or the compression is unknown.
+    Raises Malformed if they cannot be decompressed, or their size or CRC differs from the head's.
     """
     if chunk.uncompressed_size > max(DECOMPRESSED_MAX, EXPANSION_MAX * len(chunk.data)):
         raise Malformed
@@ -228,8 +229,8 @@ def decompressed(chunk: Chunk) -> bytes:
 def decompressed_start(chunk: Chunk) -> bytes:
     """Return the readable start of a chunk whose end is missing; no CRC covers it.
 
-    zstd decompresses by blocks of up to 128 KiB; data behind the last whole block is lost. lz4,
-    which this project does not write, is not read at all.
+    zstd decompresses blocks of up to 128 KiB; data after the last whole block is lost. lz4, which
+    this project does not write, is not read.
     """
     size = chunk.uncompressed_size
     if size > DECOMPRESSED_MAX or chunk.compression not in ("", "zstd"):
@@ -284,7 +285,7 @@ def split_messages(
     """Return consecutive messages from `at` on, and where they end.
 
     Their offsets count from `origin`. A message that does not fit before `end`, or is too short, is
-    left out with all behind it; at `enough` bytes no further message is taken.
+    left out with all after it; after `enough` bytes no further message is returned.
     """
     rows: list[ChunkMessage] = []
     begin, new, message, head = at, ChunkMessage._make, int(Opcode.MESSAGE), MESSAGE_RECORD
@@ -312,7 +313,7 @@ class _ChunkContent(NamedTuple):
 def split_chunk(data: bytes, places: Sequence[int] = ()) -> _ChunkContent:
     """Split a chunk's decompressed data into its records.
 
-    `places` are the offsets of its messages, in order, if known. Behind an incomplete record,
+    `places` are the offsets of its messages, in order, if known. After an incomplete record,
     reading continues at the next of them.
     """
     others: list[tuple[int, bytes]] = []

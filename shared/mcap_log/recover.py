@@ -1,10 +1,10 @@
-"""Recover an unfinished file: write a copy with the index that every reader needs.
+"""Recover an unfinished file: write a copy with the index that most readers need.
 
 The original stays until the copy is complete and on the disk. A recovery that is killed leaves the
-original unchanged, and the next one starts over.
+original unchanged, and the next one starts from the beginning.
 
-Chunks are copied byte for byte, and get the index that they lack. The mcap package's writer cannot
-copy an existing chunk, and adding each message again took 36 us a message.
+Intact chunks are copied byte for byte, and the missing index is added. The mcap package's writer
+cannot copy an existing chunk, and adding each message again took 36 us per message.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _INDICES: Final = MappingProxyType(
         Opcode.METADATA: Opcode.METADATA_INDEX,
     }
 )
-"""Records whose places a summary holds."""
+"""Kinds of records whose offsets are in a summary, and the kinds of their index records."""
 
 
 class Interrupted(Exception):  # noqa: N818 - not an error: the recorder must stop
@@ -66,11 +66,11 @@ class Interrupted(Exception):  # noqa: N818 - not an error: the recorder must st
 
 
 class _RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcome of a recovery: what it kept and what it lost."""
+    """Outcome of a recovery: the kept and the lost data."""
 
     out: Path
     finished: bool
-    """The file was finished already."""
+    """True if the file was already finished."""
     messages: int
     attachments: int
     first_ns: int
@@ -89,13 +89,13 @@ class _RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def is_finished(path: Path) -> bool:
-    """Return True if an MCAP file is finished; RunError if it cannot be read."""
+    """Return True if an MCAP file is finished; raise RunError if it cannot be read."""
     with open_log(path) as reader:
         return reader.finished
 
 
 def is_whole(path: Path) -> bool:
-    """Return True if a file is finished once, undamaged, and counts and indexes all it holds."""
+    """Return True if a file is undamaged, ends only once, and counts and indexes all content."""
     with open_log(path) as reader:
         if not reader.finished:
             return False
@@ -114,10 +114,10 @@ def is_whole(path: Path) -> bool:
 
 
 def recover(path: Path, out: Path, stop: Stop = lambda: False) -> _RecoveryResult:
-    """Copy what can be read of a file into a finished one, which then replaces `out`.
+    """Copy the readable part of a file into a finished one, which then replaces `out`.
 
-    `stop` is called between chunks; True interrupts. Raises RunError if the file cannot be read or
-    the copy cannot be written, and Interrupted.
+    `stop` is called before each record; if it returns True, Interrupted is raised. Raises RunError
+    if the file cannot be read or the copy cannot be written.
     """
     with open_log(path) as reader:
         try:
@@ -150,7 +150,7 @@ def recover(path: Path, out: Path, stop: Stop = lambda: False) -> _RecoveryResul
 
 
 def describe(outcome: _RecoveryResult) -> list[str]:
-    """Return one line for what was kept and one for each loss."""
+    """Return a line for the data that was kept, then lines for the data lost or left out."""
     kept = f"{outcome.messages} messages"
     if outcome.messages:
         seconds = (outcome.last_ns - outcome.first_ns) / NS_PER_S
@@ -170,28 +170,28 @@ def describe(outcome: _RecoveryResult) -> list[str]:
 
 
 def describe_passed_over(count: int) -> str:
-    """Return words for records of unknown kinds."""
+    """Describe records of kinds that the format does not define."""
     return f"{count} record{'s' * (count != 1)}, private or from a later version of MCAP"
 
 
 def describe_earlier_ends(count: int) -> str:
-    """Return words for ends in the middle of a file."""
+    """Describe ends of a file that have more data after them."""
     return f"{count} end{'s' * (count != 1)} in the middle of the file, where some readers stop"
 
 
 def describe_count(counted: int | None, found: int) -> list[str]:
-    """Return a line if a file's summary does not count as many messages as were found in it."""
+    """Return a line if a file has more or fewer messages than its summary counts."""
     if counted is None or counted == found:
         return []
     if found > counted:
-        return [f"its summary counts only {counted} of its {found} messages"]
+        return [f"the file's summary counts only {counted} of {found} messages"]
     return [f"lost: {counted - found} of the {counted} messages that its summary counts"]
 
 
 def describe_lost(
     cut: LostBytes | None, damage: tuple[LostBytes, ...] | list[LostBytes], *, finished: bool
 ) -> list[str]:
-    """Return a line for each place of a file that cannot be read."""
+    """Return a line for each unreadable part of a file, or one line if nothing was lost."""
     lines = []
     if cut is not None:
         lines.append(f"lost: the last {cut.end - cut.start} bytes, cut off{_when(cut)}")
@@ -214,7 +214,7 @@ def _describe_damage(loss: LostBytes) -> str:
 
 
 def clock_time(time_ns: int) -> str:
-    """Return a log time as local time of day, or as seconds if it is not a date."""
+    """Return a log time as local date and time, or in s or ns if it is not a date."""
     if time_ns < 10**17:  # lockstep: virtual time from 0
         return f"{time_ns / NS_PER_S:.3f} s"
     try:

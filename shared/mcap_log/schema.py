@@ -2,7 +2,8 @@
 
 Foxglove reads an object whose properties are booleans, strings, numbers, integers, objects, or
 arrays of one of these: no `$ref`, no unions, no null, no tuples and no array in an array. msgspec's
-own schemas have most of these (docs/logs.md), so these are made from the types themselves.
+own schemas contain most of these constructs (docs/logs.md), so the schemas here are made from the
+types themselves.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ ENUMERATIONS: Final[dict[tuple[type, str], type[IntEnum]]] = {
     (messages.OperatorIntent, "park"): messages.Park,
     (messages.RunEvent, "kind"): messages.RunEventKind,
 }
-"""Fields that are plain integers on the bus and stand for an enumeration."""
+"""Enumeration of each field that is a plain integer on the bus."""
 
 _PLAIN: Final[dict[type[inspect.Type], str]] = {
     inspect.BoolType: "boolean",
@@ -55,7 +56,7 @@ def name_of(message_type: type[Message]) -> str:
 
 
 def json_schema(message_type: type[msgspec.Struct]) -> dict[str, Any]:
-    """Return the flat JSON schema of a message type; RunError for a field that does not fit it."""
+    """Return the flat JSON schema of a message type; raise RunError for a field that cannot fit."""
     info = inspect.type_info(message_type)
     if not isinstance(info, inspect.StructType):
         raise RunError(f"{message_type}: not a msgspec struct; recorded messages must be structs")
@@ -63,7 +64,7 @@ def json_schema(message_type: type[msgspec.Struct]) -> dict[str, Any]:
 
 
 def encoded(message_type: type[Message]) -> bytes:
-    """Return the schema as bytes for the file."""
+    """Return a message type's schema, encoded for the file."""
     return msgspec.json.encode(json_schema(message_type))
 
 
@@ -109,7 +110,7 @@ def _node(info: inspect.Type, where: str) -> dict[str, Any]:
         return _array(_node(info.item_type, f"{where}[]"), where)
     raise RunError(
         f"{where}: {type(info).__name__} does not fit into a flat JSON schema; use numbers, "
-        "strings, booleans, structs, integer enumerations, or arrays of one of them"
+        "strings, booleans, structs, integer enumerations, or arrays of these"
     )
 
 

@@ -1,4 +1,4 @@
-"""Count lost messages by the sequence numbers of one key. Pure."""
+"""Count lost messages from the sequence numbers of one key. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import msgspec
 
 
 class KeyCount(msgspec.Struct, gc=False, kw_only=True):
-    """Counts of one key; feed it every sequence number in order of arrival."""
+    """Counts of one key; `feed` must receive every sequence number in order of arrival."""
 
     count: int = 0
     """Received messages."""
@@ -24,8 +24,8 @@ class KeyCount(msgspec.Struct, gc=False, kw_only=True):
     def feed(self, seq: int) -> None:
         """Count the sequence number of the next message.
 
-        Messages before the first one received are not counted as lost: a subscriber connects after
-        the sender's start, or after its own.
+        Messages before the first one received are not counted as lost, because the connection is
+        made some time after sender and subscriber have started.
         """
         step = seq - self.last_seq
         if step != 1 and self.count and not self.several:

@@ -2,18 +2,18 @@
 
 A run is `run.mcap`, and `run_1.mcap`, `run_2.mcap`, ... if it is split; each can be read alone.
 Layout of each: metadata `run`, `clock`, `packages` and `split`, the attachments, all schemas and
-channels, then zstd chunks with the messages as they came (JSON), at the end metadata `counts` (of
-this file) and the summary. The first chunk holds schemas and channels again, as the mcap package
-writes them: damage to one leaves the other.
+channels, then zstd chunks with the messages as received (JSON), at the end metadata `counts` (of
+this file) and the summary. The mcap package writes schemas and channels again in the first chunk:
+if one copy is damaged, the other remains.
 
-Time: `log_time` is when the recorder took a message off its queue (at most one drain period after
-it came), `publish_time` the message's own `t_ns`. Both are monotonic clocks. One offset, taken at
-the start and written as `offset_ns` into metadata `clock`, maps them to ns since 1970 so that
-viewers show dates: wall = monotonic + offset_ns. So `publish_time` is meaningful only for senders
-on the recorder's host.
+Time: `log_time` is the time at which the recorder read a message from its queue (at most one drain
+period after its arrival), `publish_time` the message's own `t_ns`. Both come from monotonic clocks.
+One offset, measured at the start and written as `offset_ns` into metadata `clock`, maps them to ns
+since 1970 so that viewers show dates: wall = monotonic + offset_ns. It is the recorder's offset, so
+`publish_time` is meaningful only for senders on the recorder's host.
 
 A file whose writer was killed has no summary: `shared/mcap_log/recover.py` adds one, and
-`tools/logs/run_log.py` reads it as it is. A file is locked while it is written.
+`tools/logs/run_log.py` can read the file without it. A file is locked while it is written.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _MEDIA_TYPES: Final = {
     ".urdf": "application/xml",
     ".xml": "application/xml",
 }
-_SEQUENCE_MASK: Final = 0xFFFFFFFF  # MCAP keeps 32 bits; the payload has all of them
+_SEQUENCE_MASK: Final = 0xFFFFFFFF  # MCAP stores 32 bits; the payload has all of them
 _UNSIGNED = msgspec.Meta(ge=0, le=2**62)  # so that MCAP's unsigned 64-bit times can hold it
 
 
@@ -70,7 +70,7 @@ class MessageSource(Protocol):
     """Source of messages: a stream of the bus."""
 
     def take(self) -> tuple[str, bytes, int] | None:
-        """Return (key, payload, monotonic ns of this call), or None if none is waiting."""
+        """Return (key, payload, monotonic ns of this call), or None if no message is waiting."""
 
 
 class FilePlace(Enum):
@@ -105,14 +105,14 @@ class RunWriter:
         chunk_kib: int,
         begin: bool = True,
     ) -> None:
-        """Create `run.mcap` in `directory`, or `run-1.mcap`, ... if there is a run already.
+        """Create `run.mcap` in `directory`, or `run-1.mcap`, ... if a run is there already.
 
-        `topics` are those of every key to record, `offset_ns` is wall minus monotonic clock. A
+        `topics` has the topic of every key to record; `offset_ns` is wall minus monotonic clock. A
         negative offset means that the wall clock is not set. The file's times are then monotonic,
         because MCAP has no time before 1970. `metadata` records, by name, and `attachments`, by
-        file name, go into each file; `chunk_kib` is the size of a chunk before compression. Without
-        `begin` the first file is left to `begin`. Raises RunError if the file cannot be created or
-        written, as all methods do.
+        file name, are written to each file; `chunk_kib` is the size of a chunk before compression.
+        If `begin` is False, the first file is created by calling the method `begin`. Raises
+        RunError if the file cannot be created or written, as all methods do.
         """
         self.path = directory / files.FIRST
         """The file being written, or the last one."""
@@ -127,7 +127,7 @@ class RunWriter:
         self.malformed: dict[str, int] = {}
         """Messages without a readable `t_ns` and `seq`; not written."""
         self.left_out = 0
-        """Messages that came while no file could be written."""
+        """Messages that arrived while no file could be written."""
         self._directory, self._topics = directory, topics
         self._offset_ns, self._chunk_size = max(0, offset_ns), chunk_kib * 1024
         self._metadata, self._attachments = metadata, attachments
@@ -179,7 +179,7 @@ class RunWriter:
 
     @property
     def where_is_file(self) -> FilePlace:
-        """Location of the open file, compared with its path."""
+        """Location of the open file: at its path, moved away or removed."""
         if self._file is None:
             return FilePlace.THERE
         own = os.fstat(self._file.fileno())
@@ -194,7 +194,7 @@ class RunWriter:
         return FilePlace.MOVED if own.st_nlink else FilePlace.REMOVED
 
     def begin(self, note: Mapping[str, str] | None = None) -> None:
-        """Start the run's next file, with metadata and attachments; `note` goes into `split`."""
+        """Start the run's next file, with metadata and attachments; `note` is added to `split`."""
         with self._as_run_error("cannot be created"):
             self._directory.mkdir(parents=True, exist_ok=True)
             self._stem = self._stem or files.free_stem(self._directory)
@@ -212,9 +212,9 @@ class RunWriter:
         self._before = copy.deepcopy(self.counts)
 
     def take_from(self, source: MessageSource, at_most: int) -> int:
-        """Write messages until the source is empty; return their number.
+        """Write messages until the source is empty or `at_most` are read; return the number read.
 
-        While no file is open, messages are only counted as left out.
+        While no file is open, messages are not written, only counted as left out.
         """
         if self._file is None:
             return self._leave_out(source, at_most)
@@ -246,13 +246,13 @@ class RunWriter:
         return taken
 
     def flush(self) -> None:
-        """Hand everything to the kernel: it then survives a kill of this process."""
+        """Pass all data to the kernel, so that it survives if this process is killed."""
         if self._file is not None:
             with self._as_run_error("cannot be written"):
                 self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
 
     def sync(self) -> None:
-        """Flush, and sync to the disk in the background: the data then survives a loss of power."""
+        """Flush, and sync to the disk in the background, so that all data survives a power cut."""
         if self._file is not None:
             with self._as_run_error("cannot be written"):
                 self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
@@ -263,7 +263,7 @@ class RunWriter:
         if self._file is None:
             return
         with self._as_run_error("cannot be finished"):
-            # the counts go behind the last messages
+            # the counts follow the last messages
             self._writer.flush()  # type: ignore[no-untyped-call]  # mcap's
             counts = {
                 key: msgspec.json.encode(_since(self._before[key], count)).decode()
@@ -271,7 +271,7 @@ class RunWriter:
             }
             self._writer.add_metadata(COUNTS, counts)
             self._writer.finish()  # type: ignore[no-untyped-call]  # mcap's
-            self._file.flush()  # finish() leaves the end of a stream that was passed in unwritten
+            self._file.flush()  # finish() does not flush a stream that was passed in
             self._syncer.request(self._file.fileno(), last=True)
         self._close_as_it_is()
 
@@ -291,7 +291,7 @@ class RunWriter:
         self._syncer.request(file.fileno())
 
     def _register(self, file: BinaryIO) -> None:
-        """Give every key a channel; the writer holds them back until the first chunk."""
+        """Write a channel for every key now; the mcap writer does so only in the first chunk."""
         early = RecordBuilder()
         schemas: dict[str, int] = {}
         for key, topic in self._topics.items():
@@ -316,7 +316,7 @@ class RunWriter:
 
     def _close_as_it_is(self) -> None:
         if self._file is not None:
-            with contextlib.suppress(OSError):  # what could not be written was reported already
+            with contextlib.suppress(OSError):  # a failed write was reported already
                 self._file.close()
             self._file = None
 

@@ -1,1 +1,1 @@
-"""Impairments of a network, in lockstep and on the wire."""
+"""Impairments of a network, in lockstep and live."""

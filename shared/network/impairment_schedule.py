@@ -18,19 +18,19 @@ class _Pending(NamedTuple):
     """One impairment that is not over, started or not."""
 
     begins: float
-    """Start on the owner's clock; minus infinite: with the request."""
+    """Start on the owner's clock; minus infinity: at once."""
     until: float
-    """End on the owner's clock; infinite: no end."""
+    """End on the owner's clock; infinity: no end."""
     link: str
     """A direction or a group of them."""
     what: Impairment
 
 
 class ImpairmentSchedule:
-    """All impairments by number; `report` receives an event per direction at each begin and end.
+    """All impairments by number; `report` receives an event per direction at each start and end.
 
-    Times are on the owner's clock; `now_ns` is the stamp of the events. A link is one of
-    `shared.links`, else ConfigError.
+    Times are on the owner's clock; `now_ns` is the events' time stamp. Raises ConfigError for a
+    link that is not in `shared.links`.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class ImpairmentSchedule:
     ) -> None:
         self.requested: dict[int, _Pending] = {}
         self.next_due = math.inf
-        """Time of the next begin or end, on the owner's clock."""
+        """Time of the next start or end, on the owner's clock."""
         self._directions = directions
         self._report = report
         self._coming: list[int] = []
@@ -75,9 +75,9 @@ class ImpairmentSchedule:
         self._find_next()
 
     def advance(self, clock: float, now_ns: int) -> bool:
-        """End and start what is due on the owner's clock; return True if anything was due.
+        """End and start the impairments that are due; return True if any was due.
 
-        An impairment that would be over before its start never starts.
+        `clock` is the time on the owner's clock. An impairment whose end has passed does not start.
         """
         if clock < self.next_due:
             return False
@@ -90,7 +90,7 @@ class ImpairmentSchedule:
         return True
 
     def clear(self, link: str, now_ns: int) -> int:
-        """End every impairment of a link, started or not; return their number."""
+        """End every impairment that affects a link, started or not; return their number."""
         names = set(directions_of(link))
         found = [n for n, row in self.requested.items() if names & set(directions_of(row.link))]
         for number in found:
@@ -98,7 +98,7 @@ class ImpairmentSchedule:
         return len(found)
 
     def counts(self, number: int) -> tuple[int, int]:
-        """Return the numbers of messages that passed and that were lost while it was active."""
+        """Return (passed, lost), the numbers of messages while an impairment was active."""
         found = [direction.requested(number) for direction in self._directions.values()]
         counted = [impairer for impairer in found if impairer is not None]
         return sum(one.passed for one in counted), sum(one.lost for one in counted)

@@ -15,15 +15,15 @@ LINE_MAX: Final = 65536
 
 
 class Begin(msgspec.Struct, frozen=True, tag="begin"):
-    """Request: start an impairment, now or later; its `at` is ignored."""
+    """Request: start an impairment, now or later; `inject.at` is ignored."""
 
     inject: Inject
     in_s: float = 0.0
-    """Delay, s; the network proxy waits, not the client."""
+    """Delay before the start, s; the network proxy waits, not the client."""
 
 
 class Clear(msgspec.Struct, frozen=True, tag="clear"):
-    """Request: end the impairments of a link, started or planned."""
+    """Request: end the impairments that affect a link, started or planned."""
 
     link: str = "all"
 
@@ -41,7 +41,7 @@ class RequestedImpairment(msgspec.Struct, frozen=True):
     number: int
     link: str
     detail: str
-    """The impairment, as `--inject` takes it."""
+    """The impairment, as `--inject` writes it."""
     left_s: float | None
     """Time until it ends, s; None: no end."""
     passed: int
@@ -51,10 +51,11 @@ class RequestedImpairment(msgspec.Struct, frozen=True):
     in_s: float = 0.0
     """Time until it begins, s; 0: it has begun."""
     hidden: tuple[str, ...] = ()
-    """Its directions on which another one is active (`shared.config.impairment.Direction`)."""
+    """Directions on which another impairment is active instead
+    (`shared.config.impairment.Direction`)."""
 
     def standing(self) -> str:
-        """Return why it is not active now, and where; empty if it is active."""
+        """Return why it is not active, and on how many directions; empty if it is active."""
         if self.in_s:
             return f"in {self.in_s:.1f} s"
         if not self.hidden:
@@ -63,13 +64,13 @@ class RequestedImpairment(msgspec.Struct, frozen=True):
         return "hidden" if len(self.hidden) == count else f"hidden on {len(self.hidden)} of {count}"
 
     def describe(self) -> str:
-        """Return its link, its impairment, and why it is not active now."""
+        """Return its link, its impairment and, if it is not active, why."""
         standing = self.standing()
         return f"{self.link} {self.detail}{f' ({standing})' if standing else ''}"
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """The answer to every request."""
+    """Reply to every request."""
 
     error: str = ""
     requested: tuple[RequestedImpairment, ...] = ()

@@ -1,9 +1,9 @@
-"""A CasADi graph with fixed memory: a call in a loop costs microseconds and allocates nothing.
+"""A CasADi graph with fixed memory: a call in a loop takes microseconds and allocates nothing.
 
 CasADi interprets a graph. With a C compiler, `python -m tools.graph_libraries` translates the
 graphs of a robot into C once (`deploy/lib.sh` calls it), and every process loads the libraries that
-it finds. There is no second law: the C comes from the graph, and a library is kept only if it gives
-the same numbers to the last bit. Without libraries everything runs, slower.
+it finds. A library is kept only if it gives the same numbers as its graph, to the last bit. Without
+libraries everything runs more slowly.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ import numpy as np
 from shared.arrays import Array
 
 FOLDER: Final = Path(sys.prefix) / "xrl-graphs"
-"""Libraries of this environment, one for each graph."""
+"""Folder of this environment's libraries, one for each graph."""
 FLAGS: Final = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
-"""Compiler flags. No fused multiply-add, which rounds differently from CasADi's interpreter. The
-functions of its library are an exception (`tools.graph_libraries.translation`)."""
+"""Compiler flags. No fused multiply-add, which rounds differently from CasADi's interpreter; the
+functions of CasADi's library are an exception (`tools.graph_libraries.translation`)."""
 SWITCH: Final = "XRL_GRAPHS"
-"""Environment variable; `interpreted` ignores every library."""
+"""Environment variable; with the value `interpreted`, every library is ignored."""
 
 
 class CompiledGraph:
     """A graph with fixed memory for its arguments and results.
 
-    `arguments` are written, the object is called, `results` are read; all are arrays of
-    the graph's shapes, column-major. `translated`: C translated from the graph computes them.
+    Write `arguments`, call the object, read `results`; all are arrays of the graph's shapes,
+    column-major. `translated`: True if C code translated from the graph computes them.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -62,9 +62,9 @@ class CompiledGraph:
 
 @functools.lru_cache(maxsize=64)
 def library_of(function: ca.Function) -> Path:
-    """Return the path of a graph's library, whether it was built or not.
+    """Return the path of a graph's library, even if it was not built.
 
-    Its name is a hash of the graph with all its constants, of CasADi's version and the compiler's
+    Its name contains a hash of the graph with all constants, CasADi's version and the compiler's
     flags, so another robot or law has another library. The look-up takes milliseconds and is
     cached.
     """

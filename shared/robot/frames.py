@@ -1,7 +1,7 @@
-"""Poses of torso, modules and harness in each other, and the body over the feet. Pure.
+"""Poses of torso, modules and harness in each other's frames, and the capture point. Pure.
 
 Rotations are unit quaternions (x, y, z, w). The frames are `world`; `torso`; below it on each leg
-`hip_*` (carries the thigh), `knee_*` (the shin) and `ankle_*` (the foot); `harness` on the torso
+`hip_*` (of the thigh), `knee_*` (of the shin) and `ankle_*` (of the foot); `harness` on the torso
 (docs/law.md#the-robot).
 """
 
@@ -45,10 +45,7 @@ def body_frames(geometry: GeometryConfig, q: Sequence[float]) -> list[FramePose]
 
 
 def leg_modules(geometry: GeometryConfig, side: str) -> tuple[tuple[str, str, Vector3], ...]:
-    """Return the frame above each module of a leg, the module, and its position there, m.
-
-    From the torso down.
-    """
+    """Return a leg's modules from the torso down: (frame above, module, position in it, m)."""
     hip, knee, ankle = (f"{kind}_{side}" for kind in ("hip", "knee", "ankle"))
     return (
         ("torso", hip, (0.0, side_sign(side) * geometry.w_hip / 2, 0.0)),
@@ -58,7 +55,7 @@ def leg_modules(geometry: GeometryConfig, side: str) -> tuple[tuple[str, str, Ve
 
 
 def _joint_pair(q: Sequence[float], module: str) -> tuple[float, float]:
-    """Return (phi, theta) of a module out of the joint angles (12,), rad."""
+    """Return (phi, theta) of a module from the joint angles (12,), rad."""
     number = 2 * MODULE_INDEX[module]
     return q[number], q[number + 1]
 
@@ -68,8 +65,8 @@ def torso_pose(
 ) -> tuple[Vector3, Quaternion]:
     """Return the torso's pose in the world, m: the mean of the two legs' estimates.
 
-    The world is midway between the feet, at the height of the ankles; both feet lie on the floor.
-    Joint angles are (12,), rad; `stance` is the place of the right foot, as in `PlannerStatus`.
+    The world's origin is midway between the feet, at the height of the ankles; both soles are flat
+    on the floor. Joint angles are (12,), rad; `stance` is as in `PlannerStatus`.
     """
     positions, rotations = [], []
     for side in SIDES:
@@ -160,11 +157,11 @@ def rotated(rotation: Quaternion, vector: Vector3) -> Vector3:
 
 
 def capture_point(p: Sequence[float], pdot: Sequence[float], slope: Pair = (0.0, 0.0)) -> Pair:
-    """Return where the body would come to rest as an inverted pendulum: x - slope z + x' sqrt(z/g).
+    """Return where the body comes to rest, as an inverted pendulum: x - slope z + x' sqrt(z/g).
 
-    x and y, m, from midway between the ankles. The pose p begins with COM x y z, m, z > 0; its rate
-    pdot is in m/s. The slope is the floor's rise along x and y, rad: a COM uphill of the ankles is
-    over them.
+    The result is x and y, m, from midway between the ankles. The pose p begins with COM x y z, m,
+    z > 0; its rate pdot is in m/s. The slope is the floor's rise along x and y, rad. It matters
+    because p is in floor axes, where a COM vertically above the ankles is uphill by slope z.
     """
     swing = math.sqrt(p[2] / GRAVITY)
     return p[0] - slope[0] * p[2] + swing * pdot[0], p[1] - slope[1] * p[2] + swing * pdot[1]

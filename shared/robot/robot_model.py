@@ -2,12 +2,11 @@
 
 The torso is the free root; each leg hangs from it: hip, knee, ankle. The paper writes the joints
 from the foot up (docs/law.md#the-robot: R_torso = prod Rx(phi) Ry(theta)). Here, from the torso
-down, each module is theta first, about -y, then phi, about -x, so the joint angles keep the paper's
-meaning and sign.
+down, each module turns first by theta about -y, then by phi about -x, so the joint angles have the
+paper's meaning and sign.
 
-Masses are the paper's: two hip modules, batteries and payload at the torso's centre; a knee module
-at each knee (half on the thigh, half on the shin: the same point); an ankle module in each foot, at
-the ankle.
+Masses are the paper's: two hip modules, batteries and payload in the torso; a module at each knee,
+half of it on the thigh and half on the shin; a module in each foot, at the ankle.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ from shared.config.sections import LimitConfig
 from shared.joints import KINDS, SIDES
 
 MODULE_RADIUS = 0.08
-"""m; a module is a ball of this radius: gives the links a rotational inertia (assumed)."""
+"""Radius of the ball that models a module and its rotational inertia, m (assumed)."""
 
 HARD_STOP_MARGIN = 0.15
-"""rad; distance of the hard stops beyond the soft limits (assumed)."""
+"""Distance of the hard stops beyond the soft limits, rad (assumed)."""
 
 _SIGN = {"right": -1.0, "left": 1.0}
 
@@ -33,7 +32,7 @@ def side_sign(side: str) -> float:
 
 
 def ankle_positions(config: RobotConfig) -> tuple[tuple[float, float, float], ...]:
-    """Return the two ankles' positions in m, world, (right, left): feet side by side."""
+    """Return both ankles' world positions with the feet side by side, (right, left), m."""
     return tuple((0.0, side_sign(side) * config.geometry.w_base / 2, 0.0) for side in SIDES)
 
 
@@ -126,11 +125,11 @@ def numbers(*values: float) -> str:
 def stand_pose(config: RobotConfig, height: float) -> tuple[float, ...]:
     """Return q (12, rad) close to a stand with the torso upright and the COM over the ankles.
 
-    `height` is that of the torso above the ankles, m. In the plane of a leg: the shin leans by a,
-    the thigh by b, with x_COM = 0: m_torso (l2 sin a + l1 sin b) + 2 m_act l2 sin a = 0 and the
-    leg's length l2 cos a + l1 cos b = hypot(height, span); solved by bisection on a. The small
-    frontal angles that lean each leg by its span from ankle to hip are left at zero: an inverse
-    kinematics finds them from here.
+    `height` is that of the torso above the ankles, m. In the plane of a leg the shin leans by a,
+    the thigh by b. Bisection on a solves x_COM = 0, m_torso (l2 sin a + l1 sin b) + 2 m_act l2 sin
+    a = 0, and the leg's length, l2 cos a + l1 cos b = hypot(height, span). The small frontal angles
+    that lean each leg by its span from ankle to hip are left at zero; inverse kinematics that
+    starts here finds them.
     """
     l1, l2 = config.geometry.l1, config.geometry.l2
     share = (config.torso_mass + 2 * config.mass.module) / config.torso_mass

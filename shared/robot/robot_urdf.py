@@ -1,8 +1,8 @@
 """The robot as URDF, for ROS 2: the links, joints, masses and shapes of `shared.robot.robot_model`.
 
 `torso` is the root. A module has two joints, theta about -y and phi about -x. A link without mass
-(`cross_of`) connects the part above it and the part below, which has the module's name. The joints
-have the names and signs of q (`shared.joints`).
+(`cross_of`) connects the part above the module and the part below, which has the module's name. The
+joints have the names and signs of q (`shared.joints`).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def urdf(config: RobotConfig) -> str:
 
 
 def _add_body(link: ET.Element, config: RobotConfig, kind: str) -> None:
-    """Add mass and shapes of what hangs below a module: thigh, shin or foot."""
+    """Add mass and shapes of the part below a module: thigh, shin or foot."""
     geometry, module = config.geometry, config.mass.module
     _add_visual(link, "sphere", radius=repr(MODULE_RADIUS))
     if kind == "ankle":

@@ -6,12 +6,12 @@ begin on the *base* (torso side) and end on the *platform* (operator's side). A 
 is positive: it pulls the torso towards the operator, with force f_i along u_i, the unit vector from
 base to platform.
 
-Everything is in torso axes, relative to the harness point, which is the platform's centre (an
-assumption, as is the sensor's axis: along the torso's x, operator in front). The layout is the
-usual 6-6 hexapod: three pairs of points on each circle, the platform's pairs turned by 60 degrees
-against the base's, each leg going from its base point to the nearest platform point. The half angle
-inside a pair matters: at 30 degrees both hexagons are regular and alike, and the platform can twist
-freely (singular).
+Everything is in torso axes, relative to the harness point, which is assumed to be the platform's
+centre. The sensor's axis is assumed to be the torso's x, with the operator in front. The layout is
+the usual 6-6 hexapod: three pairs of points on each circle, the platform's pairs turned by 60
+degrees against the base's, and each leg from its base point to the nearest platform point. At a
+half angle of 30 degrees inside a pair, both hexagons are regular and alike, and the platform can
+twist freely (singular).
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ PAIR_HALF_ANGLE: Final = math.radians(15.0)
 """Half the angle between the two points of a pair, on both circles (assumption)."""
 
 CONDITION_MAX: Final = 100.0
-"""Maximum condition number of G; beyond it, a load cell's error grows too much."""
+"""Maximum condition number of G; beyond it, errors of the load cells are amplified too much."""
 
 
 def leg_points(base_radius: float, platform_radius: float, height: float) -> tuple[Matrix, Matrix]:
     """Return where the six legs begin and end, in m, torso axes, from the harness point.
 
     Base points (6, 3) at x = -height, and platform points (6, 3) at x = 0. Angles run from +y
-    towards +z. Legs 0..5 go around in that direction.
+    towards +z. Legs 0 to 5 are numbered in that direction.
     """
     turns = 2.0 * math.pi / 3.0 * np.repeat(np.arange(3), 2)
     sides = np.tile([1.0, -1.0], 3)
@@ -57,7 +57,7 @@ def geometry_matrix(base_radius: float, platform_radius: float, height: float) -
     Column i is [u_i; b_i x u_i]. The wrench is [force in N; moment in N m] about the harness point
     in torso axes; leg forces are in N, tension positive. The radii of the circles on the torso's
     and the operator's side, and the height between them, are in m. Raises ConfigError if G is
-    singular or so near to it that the wrench would be noise.
+    singular, or so nearly singular that the wrench would be noise.
     """
     base, platform = leg_points(base_radius, platform_radius, height)
     u = platform - base

@@ -1,7 +1,7 @@
-"""Table of trips: their causes, their effects, and what lets the robot lead again.
+"""Table of trips: causes, and remedies that let the planner lead again.
 
-On a trip the module, or all six at the planner's request, goes to HOLD, which needs no planner. The
-limits and times are in [trips] of the robot file. `xrl faults` prints the table.
+On a trip the module goes to HOLD, or all six do at the planner's request. HOLD needs no planner.
+The limits and times are in [trips] of the robot file. `xrl faults` prints the table.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ WEARING: Final[dict[int, str]] = {
     Wearing.RESTS: "parked: tug up to unpark it",
     Wearing.AWAY: "parked: nobody touches it",
     Wearing.PULLS: "somebody pulls horizontally",
-    Wearing.BUMPED: "parked: a bump did not unpark it",
+    Wearing.BUMPED: "a bump had no effect",
 }
-"""Text of a status about the wearer, by its `wearer`."""
+"""Text about the wearer, by `PlannerStatus.wearer`."""
 
 
 class TripRow(NamedTuple):
@@ -44,28 +44,28 @@ class TripRow(NamedTuple):
     unit: str
     recovery: str
     least: bool = False
-    """True if it trips below its limit, not above."""
+    """True if a value below the limit trips."""
 
 
 _GAINS: Final = (
-    "the drivetrain is softer, or has more delay, than [robustness] of the robot file says: "
-    "compare them, then run `xrl gains`"
+    "the drivetrain is softer, or its delay longer, than in [robustness] of the robot file: "
+    "correct these values, then run `xrl gains`"
 )
 
 JOINT_TRIPS: Final[dict[Cause, TripRow]] = {
     Cause.SHAKING: TripRow(
-        "shaking", "its own torque above the law's band, root mean square", "N m", _GAINS
+        "shaking", "its torque shakes: root mean square above 8 Hz", "N m", _GAINS
     ),
     Cause.TORQUE_LIMIT: TripRow(
-        "torque_limit", "its torque at the limit of its motors", "of tau_module_max",
+        "torque_limit", "its torque is at the limit of its motors", "times joint.tau_module_max",
         "reduce the load; check whether a leg is caught or stands on an edge",
     ),
     Cause.TOO_FAST: TripRow(
-        "speed", "its joint's speed", "rad/s", "lead more slowly; check its encoder"
+        "speed", "its joint turns fast", "rad/s", "lead more slowly; check its encoder"
     ),
 }  # fmt: skip
-"""Trips of a joint service while it tracks; the planner then holds the others. After its wait,
-which each trip doubles, it may be led again."""
+"""Trips of a joint service while it tracks; the planner then holds the others. After a wait, which
+each trip doubles, the module can be led again."""
 
 PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
     Trip.LEGS: TripRow(
@@ -77,12 +77,12 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
     ),
     Trip.TRACKING: TripRow(
         "tracking", "a joint is far from its reference", "rad",
-        "let it move freely; check whether a joint is caught or its zero is wrong",
+        "let the robot move freely; check whether a joint is caught or its zero is wrong",
     ),
     Trip.UNLOADED: TripRow(
         "unloaded", "a leg carries almost no load", "N", "stand on both feet", least=True
     ),
-    Trip.SINKING: TripRow("sinking", "it sinks or rises fast", "m/s", "lead more slowly"),
+    Trip.SINKING: TripRow("sinking", "the COM sinks or rises fast", "m/s", "lead more slowly"),
     Trip.TURNING: TripRow("turning", "the torso turns fast", "rad/s", "lead more slowly"),
     Trip.HARNESS: TripRow(
         "harness", "the force on the wearer differs from the requested assist", "N",
@@ -93,21 +93,20 @@ PLANNER_TRIPS: Final[dict[Trip, TripRow]] = {
         "let the person stand up; request more assist, or lead down more slowly",
     ),
     Trip.UNATTENDED: TripRow(
-        "unattended", "it drifts without a hand on it", "m",
-        "take hold of it; the planner leads again a second later",
+        "unattended", "the robot drifts without a hand on it", "m",
+        "take hold of it",
     ),
     Trip.EDGE: TripRow(
         "edge", "a sole is loaded near its edge, sideways", "of its half width",
-        "do not lean on it from the side; the planner leads again a second later",
+        "do not lean on the robot from the side",
     ),
     Trip.TIPPING: TripRow(
         "tipping", "a sole is loaded at its edge, sideways", "of its half width",
-        "do not push it from the side; the planner leads again a second later",
+        "do not push the robot from the side",
     ),
     Trip.OFF_BALANCE: TripRow(
-        "balance", "its COM is ahead of or behind where it is held", "m",
-        "do not push it; the planner leads again a second later. If nobody pushes, run "
-        "`xrl kill planner`",
+        "balance", "the COM is ahead of or behind its reference", "m",
+        "do not push the robot. If nobody pushes, run `xrl kill planner`",
     ),
 }  # fmt: skip
 """Trips of the planner while it leads. It leads again once every value has been within its limit
@@ -115,9 +114,9 @@ for a second."""
 
 
 def limits_of(config: RobotConfig) -> TripsConfig:
-    """Return the robot's limits; with gains that no schedule certifies nothing trips.
+    """Return the robot's limits; without certified gains nothing trips.
 
-    The paper's split serves for comparison: 20 ms late it shakes, and a trip would hide that.
+    The paper's split is for comparison: at 20 ms of delay it shakes, and a trip would hide that.
     """
     return config.trips if config.law.split == "certified" else _NEVER
 
@@ -125,8 +124,8 @@ def limits_of(config: RobotConfig) -> TripsConfig:
 def untripped(config: RobotConfig) -> RobotConfig:
     """Return the robot without trips, as a baseline for studies only.
 
-    Its load is not estimated either: shaking would look like a load, and the robot would not be
-    led.
+    Its load is not estimated either: shaking would look like a load, and the planner would not
+    lead.
     """
     law = msgspec.structs.replace(config.law, load_correction=(0.0, 0.0))
     return msgspec.structs.replace(config, trips=_NEVER, law=law)
@@ -139,17 +138,20 @@ _NEVER: Final = TripsConfig(
     }
 )
 
-# ---- remedies, in the same words for status, page and ROS 2
+# ---- remedies, worded alike in the status, on the page and in ROS 2
 
 RESTART: Final = "xrl kill MODULE"
-"""Its supervisor starts it again."""
+"""Command that kills a module's service, which the supervisor then restarts."""
 REARM: Final = "xrl rearm"
-"""All six modules together, or none."""
+"""Command that re-arms all six modules together, or none."""
 OTHER_VERSION: Final = "its service has another version: use the same checkout on every host"
 
 
 def remedy_of(state: JointState) -> str:
-    """Return what lets a module track again, with MODULE for its name; "" if nothing is needed."""
+    """Return the remedy that lets a module track again; "" if none is needed.
+
+    In the remedy, MODULE stands for the module's name.
+    """
     try:
         mode, cause, drive = Mode(state.mode), Cause(state.cause), DriveStatus(state.drive)
         outside = Outside(state.outside)
@@ -166,17 +168,19 @@ def remedy_of(state: JointState) -> str:
     if drive is DriveStatus.HOLDING:
         return "automatic once the planner runs: the drive holds"
     if mode is Mode.DISARMED and drive in (DriveStatus.IDLE, DriveStatus.ERROR):
-        return f"if it persists, its log says why; hang the robot, then run {RESTART}"
+        return f"if it persists, read its log; hang the robot, then run {RESTART}"
     if mode is Mode.HOLD and cause in JOINT_TRIPS:
         return f"automatic, after a wait; if it trips again: {JOINT_TRIPS[cause].recovery}"
     if outside:
-        refused = f"the planner's {outside.name.lower()} is refused"
-        return f"{refused}: automatic after a push or a stall; if it persists, run xrl kill planner"
+        return (
+            f"the planner's {outside.name.lower()} is refused; recovery is automatic after a push "
+            "or a stall. If the refusal persists, run xrl kill planner"
+        )
     return ""
 
 
 def reason_of(status: PlannerStatus) -> str:
-    """Return why the planner does not lead, and the remedy, beyond what its mode says."""
+    """Return why the planner does not lead, beyond its mode, and after a trip the remedy."""
     if status.trip not in PLANNER_TRIPS:
         return status.why
     return f"{status.why}: {PLANNER_TRIPS[Trip(status.trip)].recovery}"

@@ -199,7 +199,7 @@ def test_gains_that_fall_are_never_sent(hocca: Hocca, seen: Observation, scale: 
         found = guard.act(seen, leads=True)
         assert found.local.source is SplitSource.UNCERTIFIED
         assert np.array_equal(found.local.D, seen.law.local.D)
-        assert "do not stand alone" in guard.state.why
+        assert "do not hold the robot alone" in guard.state.why
         assert seen.dt * (1 + ticks_held(guard, seen)) == pytest.approx(wait, abs=0.1)
         assert (guard.state.why, soft.steps) == ("", steps)
 

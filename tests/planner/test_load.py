@@ -180,7 +180,7 @@ def test_its_load_is_weighed_from_when_it_is_within_the_limits_and_that_is_repor
     while weighed.state.refused:
         assert abs(weighed.state.kg) > RESUME_FRACTION * LARGEST[0]
         weighed.bear(1.0)
-    assert weighed.said == "its load is being weighed"
+    assert weighed.said == "the load is being weighed"
     assert weighed.bear(1.0, WEIGHING_S - 2 * DT)
     assert not weighed.bear(1.0, 2 * DT)
     assert weighed.state.kg == pytest.approx(0.0, abs=0.5)
@@ -252,7 +252,7 @@ HANGS = (
     "the robot hangs: lower it until its feet bear its weight. If it stands, it carries 50 kg less "
     "than the robot file says: set mass.payload, then run `xrl gains`"
 )
-LIES = "the load lies too far {}: at most 20 N m is accepted (16 once refused)"
+LIES = "the load lies too far {}: centre it; at most 20 N m is accepted (16 once refused)"
 MORE, LESS = TARE.format("9.0 kg more", ""), TARE.format("9.0 kg less", " and nothing holds it up")
 
 
@@ -261,8 +261,8 @@ MORE, LESS = TARE.format("9.0 kg more", ""), TARE.format("9.0 kg less", " and no
     [
         ((9.0, 0.0, 0.0), MORE),
         ((-0.5, 25.0, 0.0), LIES.format("behind, by 25 N m")),
-        ((0.0, 0.5, 25.0), LIES.format("low, by 25 N m")),
-        ((0.0, -0.5, -25.0), LIES.format("high, by 25 N m")),
+        ((0.0, 0.5, 25.0), LIES.format("down, by 25 N m")),
+        ((0.0, -0.5, -25.0), LIES.format("up, by 25 N m")),
         ((-9.0, -25.0, 0.0), f"{LESS}; {LIES.format('ahead, by 25 N m')}"),
         ((6.0, 17.0, 0.5), LIES.format("behind, by 17 N m")),
         ((-50.0, 0.0, 0.0), HANGS),

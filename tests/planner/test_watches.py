@@ -397,7 +397,7 @@ def test_straight_and_still_too_hot_it_says_what_a_person_must_do() -> None:
     heated.run(3600.0, STRAIGHT, module=4)
     assert heated.said.startswith(f"{MODULES[1]} was hot")
     heated.run(HEAT.ease_s - 1.0, STRAIGHT, module=4)
-    assert "left even if straight" in heated.said
+    assert "left even on straight legs" in heated.said
     assert heated.said.startswith(MODULES[4])
 
 

@@ -133,7 +133,7 @@ def test_short_of_space_it_warns_stops_with_a_finished_file_and_goes_on_later(
     assert second == list(range(second[0], run.sent))
     left_out = second[0] - first[-1] - 1
     assert left_out > 0
-    assert f"{left_out} messages were left out" in caplog.text
+    assert f"messages left out so far: {left_out}" in caplog.text
     assert read_run(tmp_path / "run_1.mcap").metadata["split"]["why"] == "space again"
 
 
@@ -178,4 +178,4 @@ def test_a_folder_that_is_removed_at_the_end_is_told_too(
     assert "was removed while being written, with" in caplog.text
     logger = logging.getLogger("test")
     assert recorder._tell_end(run.writer, run.recording, "", logger) == 2, "the exit code"
-    assert "1 of 1 files were removed while being written" in caplog.text
+    assert "removed while being written: 1 of 1 files" in caplog.text

@@ -17,7 +17,8 @@ from mcap.reader import make_reader
 
 from shared.bus import topics
 from shared.bus.messages import JointState
-from shared.bus.session import Publisher, open_session
+from shared.bus.pubsub import Publisher
+from shared.bus.session import open_session
 from shared.bus.traces import JointTrace
 from shared.config.files import load
 from shared.exceptions import RunError

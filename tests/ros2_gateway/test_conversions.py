@@ -226,7 +226,7 @@ def test_type_hashes_are_those_of_another_implementation(distribution: str, name
 
 @pytest.mark.parametrize("text", ["-1", "233", "x", "1.5", ""])
 def test_a_domain_that_is_none_is_refused(text: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError, match="between 0 and 232"):
+    with pytest.raises(argparse.ArgumentTypeError, match="from 0 to 232"):
         rmw.domain(text)
 
 

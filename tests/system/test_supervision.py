@@ -192,7 +192,7 @@ def test_services_outlive_their_supervisor_and_are_shown_signalled_and_ended(
     code, said = order("status")
     assert (code, "nothing restarts one that ends" in " ".join(said.split())) == (0, True)
     assert fleet.pids() == pids
-    with pytest.raises(FleetError, match="processes of a fleet without a supervisor"):
+    with pytest.raises(FleetError, match="a fleet without a supervisor runs here"):
         start()
     assert fleet.pids() == pids, "a refused start ends nothing"
     code, said = order("start", "planner")

@@ -168,7 +168,7 @@ def test_the_memory_of_another_version_is_refused_with_what_to_do(
         return t_ns, re.sub(rb'"snapshot":"(?:[^"\\]|\\.)+"', b'"snapshot":"{\\\\"a\\\\":1}"', data)
 
     path = made_up(tmp_path / "a.mcap", change=foreign)
-    assert "with the checkout that wrote it" in told(["log", "resim", path], capsys)
+    assert "use the checkout that wrote the log" in told(["log", "resim", path], capsys)
 
 
 def test_a_small_file_that_expands_to_gigabytes_is_refused(
@@ -187,7 +187,7 @@ def test_a_small_file_that_expands_to_gigabytes_is_refused(
         writer.finish()
     assert path.stat().st_size < 100_000
     for verb in ("report", "play"):
-        assert "expand to over" in told(["log", verb, str(path)], capsys)
+        assert "expands to over" in told(["log", verb, str(path)], capsys)
 
 
 def test_300_000_false_marks_of_chunks_are_passed_in_time(

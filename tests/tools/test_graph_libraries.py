@@ -92,7 +92,7 @@ def test_a_library_with_other_numbers_or_hardly_any_is_refused() -> None:
         compare(graph(), graph(factor=2.0 * (1.0 + 2.0**-52)))
     x = ca.SX.sym("x")
     root = ca.Function("root", [x], [ca.sqrt(x - 10.0)])
-    with pytest.raises(RunError, match="0 of 200 results are finite"):
+    with pytest.raises(RunError, match="only 0 of 200 results are finite"):
         compare(root, root)
 
 
@@ -101,7 +101,7 @@ def test_without_a_compiler_it_says_so_and_succeeds(
 ) -> None:
     monkeypatch.setattr(shutil, "which", lambda _name: None)
     assert graph_libraries.main([]) == 0
-    assert "all runs" in capsys.readouterr().err
+    assert "more slowly" in capsys.readouterr().err
     with pytest.raises(RunError, match="no C compiler"):
         build(graph())
 

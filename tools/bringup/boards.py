@@ -1,4 +1,4 @@
-"""Settings of ODrives for bring-up: backed up, compared, written and read back by name."""
+"""Back up, compare, write and read back the settings of ODrives, by name."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from shared.exceptions import DriveError
 from shared.toml_file import read_text
 
 Value = bool | int | float | str | None
-"""Value of an endpoint; text is the name of another endpoint, None refers to no endpoint."""
+"""Value of an endpoint. A string is the name of another endpoint; None means no endpoint."""
 
 FIRMWARE: Final = (0, 5, 6)
-"""Firmware that the settings' names and the drivers are made for."""
+"""Firmware for which the drivers and the names of the settings are written."""
 OLDEST: Final = (0, 5, 4)
-"""Oldest supported firmware; earlier, CAN settings, board errors and heartbeat are different."""
+"""Oldest supported firmware; older ones differ in CAN settings, board errors and heartbeat."""
 
 AXIS_ERRORS: Final[dict[str, type[IntFlag]]] = {
     "error": AxisError, "motor.error": MotorError, "encoder.error": EncoderError,
     "controller.error": ControllerError,
 }  # fmt: skip
-"""An axis's error registers; any may be set while the others are 0."""
+"""Error registers of an axis; one may be set while the others are 0."""
 _AXIS_STATUS: Final = (
     *AXIS_ERRORS,
     "current_state",
@@ -50,20 +50,20 @@ STATUS: Final = (
     "brake_resistor_armed",
     *(f"{axis}.{name}" for axis in AXES for name in _AXIS_STATUS),
 )
-"""Endpoints of a board's state."""
+"""Endpoints that describe the state of a board."""
 
 ABSOLUTE: Final = 0x100
-"""Bit of `encoder.config.mode`: an absolute encoder."""
+"""Bit of `encoder.config.mode` that marks an absolute encoder."""
 DIRECTION: Final = "encoder.config.direction"
 _NOT_JSON: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
-"""Numbers that JSON does not have, by their text in the file."""
+"""Numbers that JSON cannot represent, by their text in the file."""
 
 CALIBRATE: Final = "hang the leg and run `xrl drive configure --apply --calibrate`"
 _CALIBRATED = {"motor.config.pre_calibrated": "motor.is_calibrated",
                "encoder.config.pre_calibrated": "encoder.is_ready"}  # fmt: skip
-"""Settings that a drive accepts only once it is calibrated, and the endpoints that show this."""
+"""Settings that a drive accepts only after calibration, and the endpoints that report it."""
 _FOUND = (DIRECTION, "encoder.config.phase_offset", "encoder.config.phase_offset_float")
-"""Results of the encoder's calibration with the present wiring. With other values the motor has no
+"""Results of the encoder calibration for the present wiring. With other values the motor has no
 torque, or runs away.
 """
 
@@ -72,7 +72,7 @@ class Board(Protocol):
     """One ODrive. Every method may take seconds.
 
     Raises:
-        DriveError: from every method: the board does not answer, or not in time.
+        DriveError: from every method, if the board does not answer in time.
     """
 
     @property
@@ -88,16 +88,16 @@ class Board(Protocol):
         """Names of all settings that this board saves."""
 
     def read(self, names: Iterable[str]) -> dict[str, Value]:
-        """Return the values of these endpoints, without those that the board lacks."""
+        """Return the values of endpoints, except those that the board lacks."""
 
     def write(self, values: Mapping[str, Value]) -> None:
-        """Write these endpoints in order; they are lost at the next restart unless saved."""
+        """Write endpoints in order; the next restart discards values that were not saved."""
 
     def save(self) -> None:
-        """Save the configuration, which restarts the board, and wait until it is back."""
+        """Save the configuration, which restarts the board, and wait until it reconnects."""
 
     def restart(self) -> None:
-        """Restart the board without saving, and wait until it is back: settings as saved."""
+        """Restart the board with its saved settings, and wait until it reconnects."""
 
     def clear_errors(self) -> None:
         """Clear the errors of both axes."""
@@ -107,24 +107,24 @@ class Board(Protocol):
 
 
 class FoundBoards(NamedTuple):
-    """The boards on one way of access."""
+    """Result of a search for boards."""
 
     boards: dict[str, Board]
     """Requested boards that answered, by serial number."""
     troubles: dict[str, str]
-    """Why a requested board is missing, by serial number."""
+    """Reason why a requested board is missing, by serial number."""
     strangers: tuple[str, ...]
-    """Serial numbers found that were not requested."""
+    """Serial numbers of boards that were found but not requested."""
 
     def in_no_module(self, robot: RobotConfig) -> str:
-        """Return a note about strangers that are in no module of the robot, or ""."""
+        """Return a note about plugged-in boards that belong to no module of the robot, or ""."""
         known = {module.serial_number.upper() for module in robot.module}
         strangers = ", ".join(serial for serial in self.strangers if serial not in known)
-        return f"; plugged in and in no [[module]]: {strangers}" if strangers else ""
+        return f"; plugged in, but in no [[module]]: {strangers}" if strangers else ""
 
 
 def equal(one: Value, other: Value) -> bool:
-    """Return True if two values are the same to a board, which keeps single floats."""
+    """Return True if two values are equal in the single precision of a board."""
     if isinstance(one, float) and isinstance(other, int | float):
         if math.isnan(one) and math.isnan(other):
             return True
@@ -140,15 +140,17 @@ def is_known(firmware: tuple[int, int, int]) -> bool:
 
 
 def describe_firmware(firmware: tuple[int, int, int]) -> str:
-    """Return "0.5.6"."""
+    """Return a version as text, such as "0.5.6"."""
     return ".".join(map(str, firmware))
 
 
 def number(values: Mapping[str, Value], name: str) -> float:
-    """Return a value that must be a number."""
+    """Return a value; raise DriveError if it is not a number."""
     value = values.get(name)
     if not isinstance(value, int | float):
-        raise DriveError(f"no number at {name}; the board must be an ODrive v3 with firmware 0.5.x")
+        raise DriveError(
+            f"{name}: not a number; the board must be an ODrive v3 with firmware 0.5.x"
+        )
     return value
 
 
@@ -159,14 +161,14 @@ class BoardBackup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     serial_number: str
     firmware: str
     settings: dict[str, Value]
-    """By the firmware's names; inf, -inf and nan as text."""
+    """Values by the firmware's names; inf, -inf and nan are text."""
 
 
 class Backup(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Backup file."""
 
     time: str
-    """Time of the backup, ISO 8601, local time with its offset."""
+    """Time of the backup, ISO 8601, local time with its UTC offset."""
     robot_file: str
     boards: tuple[BoardBackup, ...]
 
@@ -221,17 +223,17 @@ class SettingChange(NamedTuple):
     """Value to write."""
     why: str
     inhibit: str
-    """Why it cannot be written; "" if it can."""
+    """Reason why it cannot be written, or ""."""
     fits: Callable[[Value], bool]
-    """Returns True if a value is as wanted."""
+    """Checks whether a value is as wanted."""
 
 
 class ChangeResult(NamedTuple):
-    """Result of a change."""
+    """Result of one change."""
 
     change: SettingChange
     now: Value
-    """Read back after the restart."""
+    """Value read back after the restart."""
     good: bool
 
 
@@ -263,7 +265,7 @@ def against_backup(module: str, saved: Mapping[str, Value], board: Board) -> lis
         if name not in settings:
             inhibit = "missing in this board's firmware"
         elif name.partition(".")[2] in _FOUND:
-            inhibit = "calibration finds it for the wiring of the phases; the board keeps its own"
+            inhibit = "calibration measures it for the present wiring, so the board keeps its value"
         if name not in settings or not fits(before):
             changes.append(SettingChange(module, name, before, value, "", inhibit, fits))
     return changes
@@ -276,13 +278,13 @@ def refuse_armed(module: str, board: Board) -> None:
             known = state in AxisState.__members__.values()
             words = AxisState(state).name if known else str(state)
             raise DriveError(
-                f"{module}.{axis} is in {words}, not idle: saving restarts the board, and the "
-                "module goes limp. Hang the robot and run `xrl down`, or cycle its supply"
+                f"{module}.{axis} is in {words}, not idle. Saving would restart the board, and the "
+                "module would go limp. Hang the robot, then run `xrl down` or cycle the power"
             )
 
 
 def write_changes(board: Board, changes: Sequence[SettingChange]) -> list[ChangeResult]:
-    """Write a board's changes, save them, and read them back after the restart."""
+    """Write changes to a board, save them, and read them back after the restart."""
     to_write = sorted((change for change in changes if not change.inhibit), key=_watchdog_order)
     if to_write:
         board.write({change.name: change.after for change in to_write})
@@ -294,7 +296,7 @@ def write_changes(board: Board, changes: Sequence[SettingChange]) -> list[Change
 
 
 def _watchdog_order(change: SettingChange) -> float:
-    """Return a change's rank: a watchdog is off before its timeout changes, and on afterwards."""
+    """Return the rank of a change: watchdogs are disabled first, and enabled last."""
     if not change.name.endswith(".config.enable_watchdog"):
         return 0.0
     return 1.0 if change.after else -1.0
@@ -306,7 +308,7 @@ def describe_setting(value: Value) -> str:
 
 
 def difference_table(difference: Sequence[SettingChange]) -> Group:
-    """Return a difference for the terminal: a table, and the reasons below it."""
+    """Return a table of the changes for the terminal, with the reasons below it."""
     columns = (Column("module", no_wrap=True), Column("setting", no_wrap=True), "now", "new")
     rows = Table(*columns, title="difference", title_justify="left", box=box.SIMPLE_HEAD)
     reasons: dict[str, None] = {}
@@ -327,7 +329,7 @@ def _fits(row: WantedSetting, value: Value) -> bool:
 
 
 def _uncalibrated(name: str, calibrated: Mapping[str, Value]) -> str:
-    """Return why a setting cannot be written yet: the drive accepts it only once calibrated."""
+    """Return why a setting that needs calibration cannot be written yet, or ""."""
     axis, _, below = name.partition(".")
     status = _CALIBRATED.get(below)
     if status is None or calibrated.get(f"{axis}.{status}"):

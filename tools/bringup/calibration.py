@@ -1,9 +1,8 @@
-"""Calibrates the motors and encoders of a hanging robot's boards, and judges the results.
+"""Calibrate the motors and encoders of a hanging robot's boards, and judge the results.
 
-A board is restarted first, which clears its errors; no axis has been in closed loop since then. Its
-marks are written and saved once both axes are done. If the calibration ends early, another restart
-discards the measurements: a calibration that fails or is aborted leaves partial results that the
-board treats as complete (docs/drives.md#traps).
+A board first restarts, which clears its errors and idles both axes. The `pre_calibrated` marks are
+written and saved once all axes are done. If the calibration fails or is aborted, the board restarts
+again to discard partial results, which it would treat as complete (docs/drives.md#traps).
 """
 
 from __future__ import annotations
@@ -36,20 +35,20 @@ from tools.terminal import Console, marked
 MOTOR_S: Final = 4.25
 """Duration of the motor calibration, s: resistance 3 s, inductance 1.25 s."""
 LOCK_S: Final = 1.0
-"""Time before the encoder's scan out and back, s."""
+"""Time before the encoder scan begins, s; the scan goes out and back."""
 CURRENT_MARGIN: Final = 8.0
-"""Margin above `current_lim` at which a drive disarms, as shipped, A."""
+"""Excess over `current_lim` at which a drive with factory settings disarms, A."""
 POLL_S: Final = 0.1
 OVERTIME_S: Final = 3.0
 IDLE_S: Final = 2.0
 STILL_S: Final = 0.5
 STILL_WAIT_S: Final = 20.0
 STILL_TURNS: Final = 0.02
-"""Maximum motion of a still motor in `STILL_S`, turns."""
+"""Maximum motion of a motor at rest in `STILL_S`, turns."""
 SHARE_MIN: Final = 0.98
 """A procedure that ends before this fraction of its duration was aborted."""
 POLES_WITHIN: Final = 0.04
-"""Maximum relative deviation from the response of another number of pole pairs to name it."""
+"""Maximum relative error at which another number of pole pairs explains the response."""
 
 _WATCHDOG: Final = "config.enable_watchdog"
 MARKS: Final = ("motor.config.pre_calibrated", "encoder.config.pre_calibrated")
@@ -61,14 +60,14 @@ _LOOK: Final = (
 )  # fmt: skip
 
 _STOPPED: Final = (
-    "the joint is blocked, at its stop or loaded: hang the leg clear of the floor; then raise "
-    "motor.config.calibration_current (15 A turns a leg that 10 A does not)"
+    "the joint is blocked, at its stop or loaded: hang the leg clear of the floor; if that is not "
+    "enough, raise motor.config.calibration_current (15 A turns a leg that 10 A does not)"
 )
 ADVICE: Final[Mapping[tuple[str, IntFlag], str]] = {
     ("motor.error", MotorError.PHASE_RESISTANCE_OUT_OF_RANGE):
-        "check the three phase wires: one is loose or broken. Else the motor's resistance exceeds "
-        "resistance_calib_max_voltage / calibration_current: lower the current, or raise the "
-        "voltage to at most half the supply's",
+        "check the three phase wires: one is loose or broken. Otherwise the motor's resistance "
+        "exceeds resistance_calib_max_voltage / calibration_current: lower the current, or raise "
+        "the voltage to at most half the supply voltage",
     ("motor.error", MotorError.PHASE_INDUCTANCE_OUT_OF_RANGE):
         "check the three phase wires: two touch, or one is loose",
     ("motor.error", MotorError.UNBALANCED_PHASES):
@@ -79,9 +78,9 @@ ADVICE: Final[Mapping[tuple[str, IntFlag], str]] = {
     ("motor.error", MotorError.DRV_FAULT):
         "the phases have a short circuit, or the board is broken: measure between the phases",
     ("motor.error", MotorError.MODULATION_MAGNITUDE):
-        "the supply voltage is too low: resistance_calib_max_voltage must be at most half of it",
+        "the supply voltage is too low: it must be at least twice resistance_calib_max_voltage",
     ("encoder.error", EncoderError.NO_RESPONSE):
-        f"the encoder does not count while the field turns: {_STOPPED}. If the shaft did turn, "
+        f"the encoder does not count while the field turns: {_STOPPED}. If the shaft turned, "
         "check the encoder's magnet and plug",
     ("encoder.error", EncoderError.ABS_SPI_COM_FAIL):
         "the encoder does not answer: check its plug, wires, encoder.config.abs_spi_cs_gpio_pin "
@@ -91,7 +90,7 @@ ADVICE: Final[Mapping[tuple[str, IntFlag], str]] = {
 
 
 class Found(NamedTuple):
-    """Results of an axis's calibrations."""
+    """Results of calibrating an axis."""
 
     resistance: float
     inductance: float
@@ -102,15 +101,15 @@ class BoardResult(NamedTuple):
     """Result of calibrating a board."""
 
     found: dict[str, Found]
-    """By axis; saved only if nothing went wrong."""
+    """Results by axis; saved only if nothing failed."""
     why: str = ""
-    """Failure and remedy; "" if nothing went wrong."""
+    """Failure and remedy, or ""."""
     not_idle: bool = False
     """True if an axis does not report that it is idle."""
 
 
 class Procedure(NamedTuple):
-    """One requested state."""
+    """One calibration: the state to request, its name and its duration."""
 
     state: AxisState
     what: str
@@ -118,22 +117,24 @@ class Procedure(NamedTuple):
 
 
 Progress = Callable[[str, Procedure, float], None]
-"""Receives the axis, its procedure, and the seconds since the procedure began."""
+"""Receives the axis, its procedure, and the time since the procedure began, s."""
 
 
 def uncalibrated(board: Board) -> tuple[str, ...]:
-    """Return the axes of a board that do not arm because they are not calibrated."""
+    """Return the axes of a board that are not calibrated, and therefore do not arm."""
     values = board.read([f"{axis}.{name}" for axis in AXES for name in _READY])
     return tuple(axis for axis in AXES if not all(values.get(f"{axis}.{n}") for n in _READY))
 
 
 def procedures(board: Board, axis: str) -> tuple[Procedure, Procedure]:
-    """Return both calibrations of an axis, with the time that each takes."""
+    """Return both calibrations of an axis, with their durations."""
     names = [f"{axis}.encoder.config.calib_scan_{name}" for name in ("distance", "omega")]
     values = board.read(names)
     distance, rate = (number(values, name) for name in names)
     if not (distance > 0.0 and rate > 0.0):
-        raise DriveError(f"{axis}: {names[0]} and omega are {distance:g} and {rate:g}; must be > 0")
+        raise DriveError(
+            f"{names[0]} is {distance:g} and {names[1]} is {rate:g}; both must be above 0"
+        )
     scan_s = LOCK_S + 2.0 * distance / rate
     return (
         Procedure(AxisState.MOTOR_CALIBRATION, "motor", MOTOR_S),
@@ -142,7 +143,7 @@ def procedures(board: Board, axis: str) -> tuple[Procedure, Procedure]:
 
 
 def _scan_turns(values: Mapping[str, Value], axis: str) -> float:
-    """Return the turns by which an encoder's calibration moves the motor out and back."""
+    """Return how far the encoder calibration turns the motor, out and back, turns."""
     distance = number(values, f"{axis}.encoder.config.calib_scan_distance")
     poles = number(values, f"{axis}.motor.config.pole_pairs")
     return distance / (2.0 * math.pi * poles) if poles > 0.0 else math.inf
@@ -151,7 +152,7 @@ def _scan_turns(values: Mapping[str, Value], axis: str) -> float:
 def refuse_unfit(
     module: str, board: Board, axes: Sequence[str], pause: Callable[[float], None] = time.sleep
 ) -> None:
-    """Raise DriveError if a board's setup prevents its calibration, or its joint moves."""
+    """Raise DriveError if a board's settings or supply prevent calibration, or its joint moves."""
     names = [f"{axis}.{name}" for axis in axes for name in _LOOK]
     levels = [f"config.dc_bus_{name}voltage_trip_level" for name in ("under", "over")]
     values = board.read([*names, *levels, "vbus_voltage"])
@@ -193,25 +194,25 @@ def calibrate_board(
     clock: Callable[[], float] = time.monotonic,
     pause: Callable[[float], None] = time.sleep,
 ) -> BoardResult:
-    """Calibrate axes of a board in turn, mark and save them; on a failure leave it as it was.
+    """Calibrate axes of a board in turn, mark and save them; after a failure, save nothing.
 
     Args:
-        board: idle; it restarts before and after.
+        board: idle board; it restarts before and after.
         axes: "axis0", "axis1" or both.
-        interrupts: polled; an interrupt ends the calibration, idles the axis and saves nothing.
-        progress: receives the axis, its procedure, and the seconds since the procedure began.
+        interrupts: polled; a signal ends the calibration, idles the axis, and nothing is saved.
+        progress: see `Progress`.
         clock: monotonic, s.
-        pause: waits a number of seconds.
+        pause: sleeps for a time, s.
     """
     board.restart()
-    # a watchdog is fed over CAN only, and would end the calibration
+    # only CAN feeds a watchdog, which would end the calibration
     watchdogs = board.read([f"{axis}.{_WATCHDOG}" for axis in AXES])
     board.write(dict.fromkeys(watchdogs, False))
     board.clear_errors()
     found: dict[str, Found] = {}
     for axis in axes:
         for procedure in procedures(board, axis):
-            why = _await_still(board, pause)  # the previous axis has made the leg swing
+            why = _await_still(board, pause)  # the previous axis made the leg swing
             why = why or _run(board, axis, procedure, interrupts, progress, clock, pause)
             if why:
                 idle = _idle(board, axis, clock, pause)
@@ -225,7 +226,7 @@ def calibrate_board(
     lost = [axis for axis in uncalibrated(board) if axis in axes]
     after = board.read(list(marks))
     lost += [name for name in marks if after.get(name) is not True]
-    why = f"not calibrated after the restart: {', '.join(lost)}; try again" if lost else ""
+    why = f"lost in the restart: {', '.join(lost)}; try again" if lost else ""
     return BoardResult(found, why)
 
 
@@ -264,13 +265,13 @@ def _run(
             return _why_failed(board, axis, procedure, passed_s)
         if passed_s > procedure.seconds + OVERTIME_S:
             return (
-                f"it is still in state {state} after {passed_s:.0f} s; it should take "
+                f"the axis is still in state {state} after {passed_s:.0f} s instead of "
                 f"{procedure.seconds:.0f} s"
             )
 
 
 def _why_failed(board: Board, axis: str, procedure: Procedure, passed_s: float) -> str:
-    """Return why an axis that is idle again has failed its calibration, or ""."""
+    """Return why an axis that is idle again failed its calibration, or ""."""
     flag = _READY[0] if procedure.what == "motor" else _READY[1]
     names = [*(f"{axis}.{register}" for register in AXIS_ERRORS), f"{axis}.{flag}"]
     values = board.read(["error", *names])
@@ -289,13 +290,13 @@ def _why_failed(board: Board, axis: str, procedure: Procedure, passed_s: float) 
     if passed_s < SHARE_MIN * procedure.seconds:
         return (
             f"it ended after {passed_s:.1f} s instead of {procedure.seconds:.1f} s, without an "
-            "error: another program commands it"
+            "error: another program commands the axis"
         )
     return "" if values.get(f"{axis}.{flag}") else f"it ended without an error, but {flag} is False"
 
 
 def _mismatch(board: Board, axis: str) -> str:
-    """Return how far the shaft turned, the pole pairs that would fit, and other causes."""
+    """Return how far the shaft turned, the pole pairs that would explain it, and remedies."""
     name = f"{axis}.encoder.calib_scan_response"
     values = board.read([name, *(f"{axis}.{each}" for each in _LOOK)])
     if not values.get(name):
@@ -308,7 +309,7 @@ def _mismatch(board: Board, axis: str) -> str:
         words += f", as with a motor of {other} pole pairs"
     if turned > expected:
         return f"{words}: check motor.config.pole_pairs and encoder.config.cpr"
-    return f"{words}: {_STOPPED}. Else motor.config.pole_pairs or encoder.config.cpr is wrong"
+    return f"{words}: {_STOPPED}. Or motor.config.pole_pairs or encoder.config.cpr is wrong"
 
 
 def _found(board: Board, axis: str) -> Found:
@@ -333,7 +334,7 @@ def _idle(
 
 
 def _await_still(board: Board, pause: Callable[[float], None]) -> str:
-    """Wait until a board's motors are still; return how they move if they are not, else ""."""
+    """Wait until a board's motors are at rest; return a fault if they keep moving, or ""."""
     names = [f"{axis}.encoder.pos_estimate" for axis in AXES]
     moved = math.inf
     for _ in range(round(STILL_WAIT_S / STILL_S)):
@@ -348,7 +349,7 @@ def _await_still(board: Board, pause: Callable[[float], None]) -> str:
 
 
 def to_calibrate(boards: Mapping[str, Board], *, again: bool) -> dict[str, tuple[str, ...]]:
-    """Return the axes to calibrate by module: the uncalibrated ones, or all with `again`."""
+    """Return the axes to calibrate, by module: the uncalibrated ones, or all with `again`."""
     axes = {m: AXES if again else uncalibrated(board) for m, board in boards.items()}
     return {module: those for module, those in axes.items() if those}
 
@@ -356,9 +357,9 @@ def to_calibrate(boards: Mapping[str, Board], *, again: bool) -> dict[str, tuple
 def refuse_standing(
     robot: RobotConfig, run_dir: Path, found: FoundBoards, axes: Mapping[str, Sequence[str]]
 ) -> None:
-    """Raise DriveError if a robot may bear weight: a drive is armed, or a limp leg rests.
+    """Raise DriveError if the robot may stand: a drive is armed, or a limp leg rests on something.
 
-    Drives that are not on USB are monitored on CAN. A leg is judged only if it is zeroed.
+    States of drives that are not on USB are read from CAN. A leg is judged only if it is zeroed.
     """
     q: dict[str, Pair] = {}
     for module in MODULES:
@@ -383,7 +384,7 @@ def refuse_standing(
 
 
 def _can_states(robot: RobotConfig, module: str, run_dir: Path) -> tuple[int, ...]:
-    """Return the states of a module's axes from their heartbeats on CAN; silent axes have none."""
+    """Return the states in the heartbeats of a module's axes on CAN, without silent axes."""
     wiring = robot.module_named(module)
     seconds = can_monitor.long_enough(robot.drive.heartbeat_period_ms)
     bus = can_monitor.bus_config(robot, wiring.bus, run_dir)
@@ -401,17 +402,17 @@ def calibrate(
     yes: bool,
     check: Callable[[], None],
 ) -> int:
-    """Ask and calibrate, one module after the other; return the exit code.
+    """Ask the person, and calibrate one module after another; return the exit code.
 
-    A failed module does not stop the others, unless it does not become idle.
+    After a failed module the next one is calibrated, unless the failed one is not idle.
 
     Args:
         console: for questions and results.
         robot: robot file.
-        boards: by module, with the axes to calibrate.
+        boards: board and axes to calibrate, by module.
         interrupts: deferred while an axis calibrates.
         yes: do not ask.
-        check: raises an error if another program now holds the drives.
+        check: raises an error if another program holds the drives.
     """
     code, done = 0, list[str]()
     for module, (board, those) in boards.items():
@@ -419,8 +420,8 @@ def calibrate(
             refuse_unfit(module, board, those)
             seconds = sum(p.seconds for axis in those for p in procedures(board, axis))
             console.print(
-                f"\n{module}: {' and '.join(those)}, {seconds:.0f} s; each axis turns its motor by "
-                "about a turn and back, which moves phi and theta by 0.2 rad"
+                f"\n{module}: {' and '.join(those)}, {seconds:.0f} s; each motor makes about a "
+                "turn and back, which moves phi and theta by 0.2 rad"
             )
             if not drive_access.confirm(
                 "Does its leg hang free, with hands off and the power switch in reach?", yes=yes
@@ -432,7 +433,10 @@ def calibrate(
                 result = calibrate_board(board, those, interrupts, partial(_show, status, module))
         except DriveError as error:
             console.print(marked("[bold red]{}[/]: {}", module, error))
-            console.print("its calibration ends on its own; then switch its supply off and on")
+            console.print(
+                f"if a calibration of {module} had begun, wait until it ends, then switch its "
+                "supply off and on"
+            )
             code = FAULT_EXIT_CODE
             continue
         good = tell(console, robot, module, result)
@@ -444,7 +448,7 @@ def calibrate(
     if done:
         console.print(
             f"calibrated, and therefore unzeroed: {', '.join(done)}; next, run `xrl drive zero "
-            "MODULE --at PHI,THETA` for each"
+            "MODULE --at PHI,THETA` for each module"
         )
     if rest:
         console.print(f"not calibrated: {', '.join(rest)}")
@@ -452,7 +456,7 @@ def calibrate(
 
 
 def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult) -> bool:
-    """Print the result of a board's calibrations; return False if it needs action."""
+    """Print the result of calibrating a board; return False if a person must act."""
     for axis, found in result.found.items():
         console.print(
             f"{module}.{axis}: {found.resistance:.3g} ohm, {1e6 * found.inductance:.3g} uH, "
@@ -464,7 +468,7 @@ def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult)
             console.print(marked("[bold red]{}: {}[/]", module, NOT_IDLE))
         else:
             console.print(
-                "nothing was saved; the board has restarted with its old settings, without a zero"
+                "the board has restarted with the settings that it has stored, without a zero"
             )
         return False
     values = {f"{axis}.encoder.is_ready": True for axis in result.found} | {

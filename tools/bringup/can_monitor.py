@@ -1,8 +1,8 @@
-"""Monitors a CAN bus of the robot for a moment, and judges its drives, load cells and IMU.
+"""Monitor a CAN bus of the robot for a moment, and judge its drives, load cells and IMU.
 
-Nothing is sent to a bus whose services are up: any frame feeds a drive's watchdog, and would hide a
-dead service. Otherwise each axis gets three requests: its version, which only firmware 0.6 answers;
-its encoder count, which only 0.5 answers; and its supply voltage.
+Nothing is sent on a bus whose services are up, because any frame feeds a drive's watchdog and would
+hide a dead service. Otherwise three requests are sent to each axis: for its version, which only
+firmware 0.6 answers, its encoder count, which only 0.5 answers, and its supply voltage.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from tools.fleet.process_table import SIMULATED_CAN
 LISTEN_S: Final = 0.5
 LISTEN_MAX_S: Final = 3.0
 HEARTBEATS: Final = 3.0
-"""Minimum number of heartbeat periods to listen for."""
+"""Minimum time to listen, in heartbeat periods."""
 
 QUESTIONS: Final = (Command06.GET_VERSION, Command.GET_ENCODER_COUNT, Command.GET_VBUS)
 _WAIT_S = 0.05
@@ -49,19 +49,19 @@ _GAPS_MIN = 3
 
 
 class NodeTraffic(msgspec.Struct):
-    """Frames of one axis."""
+    """Contents and arrival times of the frames from one axis."""
 
     heartbeat: Heartbeat | None = None
     """Newest heartbeat, decoded as in firmware 0.5."""
     heartbeats_s: list[float] = []
-    """Times of arrival, s."""
+    """Arrival times, s."""
     estimates_s: list[float] = []
     pos_turns: float | None = None
-    """Newest estimate; firmware 0.5.6 reports 0 until its first closed loop."""
+    """Newest position estimate; firmware 0.5.6 reports 0 until its first closed loop."""
     shadow_count: int | None = None
-    """Encoder count, which only firmware 0.5 answers."""
+    """Encoder count, which only firmware 0.5 sends."""
     version: Version | None = None
-    """Version, which only firmware 0.6 answers."""
+    """Version, which only firmware 0.6 sends."""
     vbus_voltage: float | None = None
 
 
@@ -69,26 +69,26 @@ S = TypeVar("S")
 
 
 class SensorTraffic(msgspec.Struct, Generic[S]):
-    """Samples of a sensor, and their times of arrival."""
+    """Samples of a sensor, and their arrival times."""
 
     samples: list[S] = []
     times_s: list[float] = []
 
 
 class BusTraffic(msgspec.Struct):
-    """Traffic of one bus."""
+    """Traffic on one bus."""
 
     trouble: str = ""
-    """Why the bus could not be monitored; "" if it could."""
+    """Reason why the bus could not be monitored, or ""."""
     seconds: float = 0.0
     frames: int = 0
     error_frames: int = 0
     nodes: dict[int, NodeTraffic] = {}
-    """By node id: the expected nodes, and others that send heartbeats."""
+    """By node id: expected nodes, and others that send heartbeats."""
     cells: SensorTraffic[Vector6] = msgspec.field(default_factory=SensorTraffic)
     imu: SensorTraffic[ImuSample] = msgspec.field(default_factory=SensorTraffic)
     malformed: int = 0
-    """Frames of a sensor that were out of order or too short."""
+    """Number of sensor frames that were out of order or too short."""
 
 
 def listen(
@@ -100,7 +100,7 @@ def listen(
     imu: bool = False,
     seconds: float = LISTEN_S,
 ) -> BusTraffic:
-    """Listen to a bus for axes, load cells and an IMU; poll axes only if no services are up."""
+    """Listen on a bus for axes, load cells and an IMU. Poll axes only if no services are up."""
     traffic = BusTraffic(nodes={node: NodeTraffic() for node in nodes})
     try:
         with _bus(config) as bus:
@@ -120,9 +120,9 @@ def listen(
 def listen_to(
     robot: RobotConfig, name: str, run_dir: Path, *, poll_nodes: bool, seconds: float | None = None
 ) -> BusTraffic:
-    """Listen to a bus of a robot for all expected senders; the default time is long enough.
+    """Listen to all expected senders on a bus of a robot; the default time is `long_enough`.
 
-    All times are by the fleet's clock in `run_dir`, so no frame is late in slow motion.
+    Times are on the clock of the fleet in `run_dir`, so no frame appears late in slow motion.
     """
     keep_pace(run_dir)
     nodes = bus_nodes(robot)[name]
@@ -134,13 +134,13 @@ def listen_to(
 
 
 def bus_config(robot: RobotConfig, name: str, run_dir: Path) -> CanConfig:
-    """Return a bus of a robot, `{run}` in its channel expanded."""
+    """Return a bus of a robot, with `{run}` expanded in its channel."""
     bus = robot.can[name]
     return CanConfig(interface=bus.interface, channel=expand(bus.channel, run_dir))
 
 
 def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
-    """Return the expected nodes of each bus, including buses without nodes."""
+    """Return the expected nodes of each bus; buses without drives have none."""
     nodes: dict[str, tuple[int, ...]] = dict.fromkeys(robot.buses, ())
     for module in robot.module:
         nodes[module.bus] = (*nodes[module.bus], *module.node_ids)
@@ -149,7 +149,7 @@ def bus_nodes(robot: RobotConfig) -> Mapping[str, tuple[int, ...]]:
 
 @contextlib.contextmanager
 def _bus(config: CanConfig) -> Iterator[can.BusABC]:
-    """Open a bus; every error becomes a DriveError."""
+    """Open a bus; raise every error as a DriveError."""
     try:
         with can.Bus(interface=config.interface, channel=config.channel, ignore_config=True) as bus:
             yield bus
@@ -158,15 +158,16 @@ def _bus(config: CanConfig) -> Iterator[can.BusABC]:
 
 
 def long_enough(heartbeat_period_ms: int) -> float:
-    """Return how long to listen for heartbeats of this period, s."""
+    """Return the time to listen for heartbeats of this period, s."""
     return min(LISTEN_MAX_S, max(LISTEN_S, HEARTBEATS * 1e-3 * heartbeat_period_ms))
 
 
 def period_ms(times_s: Sequence[float], wanted_ms: float) -> float | None:
     """Return the period of frames, ms; None if there are too few.
 
-    It is the median or the mean of the gaps, whichever is nearer to the wanted period. A reader
-    that stalls shifts the mean, a sender that catches up the median, and another setting both.
+    The result is the median or the mean of the gaps, whichever is nearer to the wanted period. A
+    stalled reader shifts only the mean, a sender that catches up only the median, and a wrong
+    setting shifts both.
     """
     gaps = [after - before for before, after in pairwise(times_s)]
     if len(gaps) < _GAPS_MIN:
@@ -175,7 +176,7 @@ def period_ms(times_s: Sequence[float], wanted_ms: float) -> float | None:
 
 
 def _mean_ms(times_s: Sequence[float]) -> float:
-    """Return the mean period of two frames or more, ms."""
+    """Return the mean period of at least two frames, ms."""
     return 1e3 * (times_s[-1] - times_s[0]) / (len(times_s) - 1)
 
 
@@ -210,7 +211,7 @@ def _add(sensor: SensorTraffic[S], sample: S | None, message: can.Message) -> No
 
 
 def _of_node(message: can.Message, nodes: dict[int, NodeTraffic]) -> None:
-    """Store a frame from an axis; a heartbeat adds a node that was not expected."""
+    """Store a frame from an axis; a heartbeat also adds an unexpected node."""
     node, command = cansimple.split_id(message.arbitration_id)
     data = bytes(message.data)
     if command == Command.HEARTBEAT:
@@ -233,9 +234,9 @@ def _of_node(message: can.Message, nodes: dict[int, NodeTraffic]) -> None:
 
 
 PERIOD_SHARE: Final = 0.2
-"""Maximum relative error of a measured period: more is a setting, not a busy machine."""
+"""Maximum relative error of a measured period; a busy machine stays below it."""
 TWICE: Final = 0.65
-"""Fraction of the wanted period below which two axes share one node id."""
+"""Fraction of the wanted period; below it, two axes probably share one node id."""
 RATE_SHARE: Final = 0.2
 
 
@@ -250,9 +251,9 @@ def drive_rows(
         heard = (node for node, other in traffic.nodes.items() if other.heartbeat)
         strangers = ", ".join(map(str, sorted(set(heard) - set(node_ids))))
         fix = (
-            f"nodes {strangers} send instead: set `node_ids`, or the drive's node ids"
+            f"heartbeats come from other nodes ({strangers}): correct `node_ids` or the drive's ids"
             if strangers
-            else "check supply, wires, 120 ohm at both ends; the drive's baud rate must be 1000000"
+            else "check supply, wires, 120 ohm at both ends, and the drive's baud rate, 1000000"
         )
         found = f"{traffic.frames} frames, {traffic.error_frames} errors"
         return [wrong(module, "heartbeats", found, f"nodes {node_ids[0]}, {node_ids[1]}", fix)]
@@ -261,7 +262,7 @@ def drive_rows(
         known = traffic.nodes.get(node, NodeTraffic())
         rows += _axis_rows(robot, f"{module}.{axis}", node, known, services_up=services_up)
     if traffic.error_frames:
-        fix = "check wires, 120 ohm at both ends, and equal baud rates"
+        fix = "check wires, 120 ohm at both ends, and that all baud rates are equal"
         found = f"{traffic.error_frames} in {traffic.seconds:.1f} s"
         rows.append(warning(module, "CAN error frames", found, "none", fix))
     return rows
@@ -273,18 +274,18 @@ def harness_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
     if traffic.trouble:
         return [_closed(robot, subject, harness.bus, traffic)]
     if not cells.samples:
-        fix = "check the amplifier's supply and wires, and frames (shared/can/sensor_frames.py)"
-        why = "no assist force, no easing, no stop at overload"
+        fix = "check the amplifier's supply, wires and frames (shared/can/sensor_frames.py)"
+        why = "no closed-loop assist, no eased lead, no stop at overload"
         found, wanted = f"{traffic.frames} other frames", f"{harness.rate_hz:g} Hz"
         return [wrong(subject, what, found, wanted, fix, why)]
     largest = max(abs(force) for sample in cells.samples for force in sample)
     good = largest < harness.leg_force_max  # NaN is not
-    fix = "unload the harness; if the reading stays, the cell or its wire is broken"
+    fix = "unload the harness; if the reading stays, a load cell or its wire is broken"
     found, limit = f"{largest:.0f} N", f"< {harness.leg_force_max:g} N"
     rate_fix = "set the amplifier's rate, or `harness.rate_hz`"
     return [
         _rate_row(subject, what, cells, harness.rate_hz, rate_fix),
-        judged(good, subject, "largest force", found, limit, fix, "saturated and not valid"),
+        judged(good, subject, "largest force", found, limit, fix, "saturated, so it is invalid"),
         *_lost_frames(subject, traffic),
     ]
 
@@ -301,7 +302,7 @@ def imu_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
         return [wrong(subject, what, found, f"{imu.rate_hz:g} Hz", fix, why)]
     known = sum(sample.valid for sample in samples)
     found, good = f"{known} of {len(samples)} samples", known == len(samples)
-    fix = "leave it still for a minute; its status word reports that its filter has not settled"
+    fix = "leave it at rest for a minute; its status word reports that its filter has not settled"
     return [
         _rate_row(subject, what, traffic.imu, imu.rate_hz, "set its output rate, or `imu.rate_hz`"),
         judged(good, subject, "orientation valid", found, "all", fix, why),
@@ -310,12 +311,12 @@ def imu_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
 
 
 def _closed(robot: RobotConfig, subject: str, name: str, traffic: BusTraffic) -> Finding:
-    """Return the row of a bus that cannot be monitored."""
+    """Return the row for a bus that cannot be monitored."""
     bus, trouble = robot.can[name], traffic.trouble
     if bus.interface == SIMULATED_CAN:
-        fix = "this fleet's simulator is missing: see `xrl status`, or run `xrl down` and `xrl up`"
+        fix = "this fleet's simulator has ended: see `xrl status`, or run `xrl down` and `xrl up`"
     elif bus.interface != "socketcan":
-        fix = f"python-can's {bus.interface} on {bus.channel}: check its adapter and driver"
+        fix = f"check adapter and driver of python-can's {bus.interface} on {bus.channel}"
     elif os.strerror(errno.EAFNOSUPPORT) in trouble:
         fix = "`sudo modprobe can_raw`: this kernel has no CAN (a container or a minimal kernel)"
     else:
@@ -333,7 +334,7 @@ def _rate_row(
 
 
 def _lost_frames(subject: str, traffic: BusTraffic) -> list[Finding]:
-    """Report a sensor's frames that were out of order, which means that others were lost."""
+    """Report sensor frames that were out of order, because others were lost."""
     if not traffic.malformed:
         return []
     fix = "frames are lost: check wires and 120 ohm at both ends"
@@ -341,10 +342,10 @@ def _lost_frames(subject: str, traffic: BusTraffic) -> list[Finding]:
 
 
 def positions(robot: RobotConfig, module: str, traffic: BusTraffic) -> tuple[float, float] | None:
-    """Return both motors' positions in turns, as the drive counts them; None without a reply.
+    """Return both motors' positions in turns, as the drive counts them; None if unknown.
 
-    The count is used where the estimate is 0, as in firmware 0.5.6 until its first closed loop. If
-    the drive did not answer with a count, the position is unknown.
+    If the estimate is 0, as in firmware 0.5.6 until its first closed loop, the encoder count is
+    used instead.
     """
     first, second = (
         _turns(traffic.nodes.get(node, NodeTraffic()), robot.joint.encoder_counts_per_turn)
@@ -367,10 +368,10 @@ def _axis_rows(
         return [wrong(subject, "heartbeat", f"node {node} silent", "traffic", fix)]
     if traffic.version is not None:
         found = describe_firmware(traffic.version.firmware)
-        fix = "the settings of firmware 0.6 are not read back yet: check them in its web GUI"
+        fix = "settings of firmware 0.6 cannot be read here: check them in its web GUI"
         return [warning(subject, "firmware", found, "0.5.6", fix, "settings and errors differ")]
     drive = robot.drive
-    # Use the flags too: `axis_error` alone can stay 0.
+    # `errors` includes the flags of the heartbeat, because `axis_error` alone can stay 0.
     errors = traffic.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED
     words = describe_flags(AxisError, errors) if errors else "none"
     beats, estimates = traffic.heartbeats_s, traffic.estimates_s
@@ -388,11 +389,11 @@ def _period(
     module = subject.partition(".")[0]
     measured = period_ms(times_s, wanted_ms)
     if len(times_s) > 2 and _mean_ms(times_s) < TWICE * wanted_ms:
-        measured = _mean_ms(times_s)  # two senders: gaps of 1 and 19 ms have one sender's median
+        measured = _mean_ms(times_s)  # gaps of two senders, such as 1 and 19 ms, fool the median
     wanted = f"{wanted_ms:g} ms"
     fix = f"set config.can.{setting}: `xrl drive configure --apply --module {module}`"
     if measured is None and not times_s:
-        return wrong(subject, what, "none", wanted, fix, "they are the joint service's clock")
+        return wrong(subject, what, "none", wanted, fix, "encoder frames clock the service")
     if measured is None:
         return warning(subject, what, f"{len(times_s)} received", wanted, fix)
     why = "or this machine is too busy"

@@ -1,4 +1,4 @@
-"""Checks of ODrives: settings and state of one board, and comparison of all boards. Pure."""
+"""Check the settings and state of each ODrive, and compare all ODrives. Pure."""
 
 from __future__ import annotations
 
@@ -30,24 +30,25 @@ from tools.bringup.findings import Finding, advised, judged, ok, warning, wrong
 Values = Mapping[str, Value]
 
 OVERVOLTAGE_SHARE: Final = 0.95
-"""Maximum supply voltage, as a fraction of the trip level: braking legs need the rest."""
+"""Maximum supply voltage, as a fraction of the trip level: braking legs raise the voltage."""
 
 TEMPERATURES: Final = (-10.0, 70.0)
-"""Valid range of an idle output stage, C."""
+"""Valid temperatures of an idle output stage, C."""
 
-FIND_CAUSE: Final = "find the cause; arming by `xrl up` clears it, as does a power cycle"
+FIND_CAUSE: Final = "find the cause; arming (`xrl up`) or a power cycle clears the error"
 
 Boards = Mapping[str, Mapping[str, Value]]
-"""By module: a board's settings and readings."""
+"""Settings and readings of each board, by module."""
 
 BOARDS_MIN: Final = 3
-"""With fewer boards it is unclear which one differs from the rest."""
+"""Minimum number of boards to compare: with fewer, it is unclear which one differs."""
 MEASURED: Final = ("motor.config.phase_resistance", "motor.config.phase_inductance")
-"""Calibration results; similar for motors of one kind."""
+"""Calibration results, which are similar for motors of one kind."""
 MEASURED_SHARE: Final = 0.3
-"""Maximum deviation from the median, as a fraction: copper at 100 C has 30 % more than at 20 C."""
+"""Maximum relative deviation from the median: copper has 30 % more resistance at 100 C than
+at 20 C."""
 VOLTS_APART: Final = 1.0
-"""Maximum deviation from the median voltage, V: tolerance of boards on one supply, at rest."""
+"""Maximum deviation from the median voltage of boards on one supply, at rest, V."""
 
 _OWN: Final = frozenset(
     {setting.name for setting in (*AXIS_TABLE, *DRIVE_TABLE)}
@@ -61,7 +62,7 @@ _OWN: Final = frozenset(
         *("controller.config.anticogging.index", "motor.config.direction"),
     }
 )
-"""Settings, without their axis, that are not compared between boards: they are compared with the
+"""Settings, without their axis, that are not compared between boards. They are compared with the
 robot file, found by calibration, or written by services."""
 
 
@@ -81,7 +82,7 @@ def firmware_row(module: str, firmware: tuple[int, int, int]) -> Finding:
 
 
 def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values) -> list[Finding]:
-    """Compare a board's settings with the wanted ones; all that match make one row."""
+    """Compare a board's settings with the wanted ones; all that match share one row."""
     rows = []
     fix = f"`xrl drive configure --apply --module {module}`"
     for setting in wanted:
@@ -100,18 +101,18 @@ def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values
 
 
 def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Finding]:
-    """Judge the sign of the currents, as each axis's encoder calibration has found it.
+    """Judge the direction that the encoder calibration of each axis found.
 
-    If the direction is -1, the firmware inverts the torque: the motion is the same, but its
-    currents have the opposite sign. USB reads direction and currents; CAN of firmware 0.5 reads
-    only the currents. An uncalibrated axis has no direction.
+    If the direction is -1, the firmware inverts the torque: the motion is correct, but the reported
+    currents have the opposite sign. Over USB, direction and currents can be read; over CAN with
+    firmware 0.5, only the currents. An uncalibrated axis has no direction, and therefore no row.
     """
     over_can = robot.joint_service.driver == "odrive_can"
     fix = (
-        "swap two of the motor's phases and calibrate again; `motor_signs` is for mirrored legs, "
-        "not for this"
+        "swap two of the motor's phases and calibrate again; `motor_signs` is only for mirrored "
+        "legs"
     )
-    why = "CAN does not report it: a service that takes over the drive would reverse its torque"
+    why = "CAN does not report it: a service that takes over the drive would reverse the torque"
     rows = []
     for axis in AXES:
         value = values.get(f"{axis}.{DIRECTION}")
@@ -125,9 +126,9 @@ def direction_rows(module: str, values: Values, robot: RobotConfig) -> list[Find
 
 
 def error_rows(module: str, values: Values) -> list[Finding]:
-    """Return rows for the board's error registers; one row if there is no error.
+    """Return a row for each error of a board, or one ok row if there is none.
 
-    Arming clears them all, so a watchdog that expired while no service ran is not a fault.
+    An expired watchdog is no fault: no service fed it, and arming clears the error.
     """
     rows = []
     if error := int(number(values, "error")):
@@ -146,11 +147,11 @@ def error_rows(module: str, values: Values) -> list[Finding]:
 def condition_rows(
     module: str, values: Values, trip_levels: tuple[float, float], *, services_up: bool
 ) -> list[Finding]:
-    """Judge calibration, supply and state, by the board's settings and `boards.STATUS`."""
+    """Judge supply, brake resistor, temperature, calibration and state from a board's values."""
     rows = [_voltage(module, number(values, "vbus_voltage"), trip_levels)]
     if values.get("config.enable_brake_resistor") and "brake_resistor_armed" in values:
         armed = bool(values["brake_resistor_armed"])
-        fix = "check `brake_resistance` and its wires; power off and on"
+        fix = "check `brake_resistance` and the resistor's wires; cycle the power"
         why = "neither axis arms without it"
         found = "armed" if armed else "not armed"
         rows.append(judged(armed, module, "brake resistor", found, "armed", fix, why))
@@ -164,7 +165,7 @@ def condition_rows(
             for part, name in (("motor", "motor.is_calibrated"), ("encoder", "encoder.is_ready"))
             if not values.get(f"{axis}.{name}")
         ]
-        found, why = f"{' and '.join(lacking)} not" if lacking else "yes", "it cannot be armed"
+        found, why = f"{' and '.join(lacking)} not" if lacking else "yes", "the axis cannot arm"
         rows.append(judged(not lacking, subject, "calibrated", found, "yes", CALIBRATE, why))
         state = int(number(values, f"{axis}.current_state"))
         rows.append(state_row(subject, state, services_up=services_up))
@@ -179,23 +180,23 @@ def state_row(subject: str, state: int, *, services_up: bool) -> Finding:
         return ok(subject, "state", found, "idle")
     if state == AxisState.CLOSED_LOOP_CONTROL and services_up:
         return ok(subject, "state", found, "armed by its service")
-    fix = "hang the robot; `xrl up` takes it over, power off releases it"
+    fix = "hang the robot; `xrl up` takes over the drive, and power off releases it"
     return warning(subject, "state", found, "idle", fix, "it moves or holds without a service")
 
 
 def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -> list[Finding]:
-    """Judge the position of a module's joint from its motors' positions, as the drive counts."""
+    """Judge the position of a module's joint from the positions that its drive counts."""
     mark, again = robot.drive.zero_mark_turns, f"`xrl drive zero {module} --at PHI,THETA`"
     a, b = turns[0] - mark, turns[1] - mark
     if mark > 0.0 and max(abs(a), abs(b)) > 0.5 * mark:
         found = f"motors at {turns[0]:.1f}, {turns[1]:.1f} turns"
-        why = "it lost its zero with the power, and cannot be armed without a zero"
+        why = "the drive lost its zero with its power, and cannot be armed without a zero"
         return [wrong(module, "zero", found, f"about {mark:g}", again, why)]
     q = joint_from_motor((a, b), robot.joint.gear_ratio)
     rows = [ok(module, "zero", "known", "known")]
     limits = robot.joint_limits()[2 * MODULE_INDEX[module] :][:2]
-    fix = f"move it there by hand; if it is already there, run {again}"
-    why = "it cannot be armed outside its limits"
+    fix = f"move it inside by hand; if it is already inside, run {again}"
+    why = "a joint outside its limits cannot be armed"
     for name, angle, (low, high) in zip(JOINT_AXES, q, limits, strict=True):
         inside, found, wanted = low <= angle <= high, f"{angle:.2f} rad", f"{low:g} to {high:g}"
         rows.append(judged(inside, f"{module}.{name}", "angle", found, wanted, fix, why))
@@ -203,7 +204,7 @@ def position_rows(module: str, turns: tuple[float, float], robot: RobotConfig) -
 
 
 def describe_flags(kind: type[IntFlag], bits: int) -> str:
-    """Return an error register as its firmware names it, unknown bits in hex."""
+    """Return the names of an error register's bits, and unknown bits in hex."""
     names = [flag.name or "" for flag in kind if flag and bits & flag == flag]
     rest = bits & ~sum(flag for flag in kind if flag)
     return " ".join([*names, *([hex(rest)] if rest else [])])
@@ -211,8 +212,8 @@ def describe_flags(kind: type[IntFlag], bits: int) -> str:
 
 def _temperature(subject: str, celsius: float) -> Finding:
     low, high = TEMPERATURES
-    fix = "let it cool; if the reading stays, the thermistor is broken: replace the board"
-    why = "from 100 C the drive reduces its current, at 120 C it disarms"
+    fix = "let the board cool; if the reading stays, the thermistor is broken: replace the board"
+    why = "from 100 C on the drive reduces its current, and at 120 C it disarms"
     good, found = low <= celsius <= high, f"{celsius:.0f} C"  # NaN is not good
     return advised(good, subject, "temperature", found, f"{low:g} to {high:g} C", fix, why)
 
@@ -222,36 +223,36 @@ def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Fin
     wanted = f"{low:g} to {high:g} V"
     found = f"{volts:.1f} V"
     if volts <= low:
-        return wrong(module, "supply", found, wanted, "switch the supply on; check its fuse")
+        return wrong(module, "supply", found, wanted, "switch the supply on, and check its fuse")
     if volts >= high:
-        return wrong(module, "supply", found, wanted, "use a lower supply, or another board")
+        return wrong(module, "supply", found, wanted, "lower the voltage, or use another board")
     if volts > OVERVOLTAGE_SHARE * high:
-        fix = "use a lower supply: braking legs raise it"
+        fix = "use a lower supply voltage: braking legs raise it"
         return warning(module, "supply", found, f"< {OVERVOLTAGE_SHARE * high:.1f} V", fix)
     return ok(module, "supply", found, wanted)
 
 
 def trip_levels_of(values: Values) -> tuple[float, float]:
-    """Return a board's own under- and over-voltage levels, V."""
+    """Return a board's under- and overvoltage trip levels, V."""
     low, high = (
         number(values, f"config.dc_bus_{name}voltage_trip_level") for name in ("under", "over")
     )
     if low >= high:
         raise DriveError(
-            f"its undervoltage trip level, {low:g} V, must be below its overvoltage trip level, "
+            f"its undervoltage trip level is {low:g} V; must be below the overvoltage trip level, "
             f"{high:g} V"
         )
     return low, high
 
 
 def _split_name(module: str, name: str) -> tuple[str, str]:
-    """Return "knee_left.axis0" and the setting's name below it."""
+    """Return the subject, such as "knee_left.axis0", and the setting's name without its axis."""
     axis, _, rest = name.partition(".")
     return (f"{module}.{axis}", rest) if axis in AXES else (module, name)
 
 
 def alike_rows(boards: Boards) -> list[Finding]:
-    """Return settings in which few boards differ from most, and implausible motor values."""
+    """Compare boards: settings in which few differ from most, motor data, and supply voltages."""
     if len(boards) < BOARDS_MIN:
         return []
     names = dict.fromkeys(name for values in boards.values() for name in values)
@@ -267,14 +268,14 @@ def _is_shared(name: str) -> bool:
 
 
 def _odd_ones(name: str, boards: Boards) -> list[Finding]:
-    """Return a row for each board whose setting differs from that of more than half of them."""
+    """Return a row for each board whose setting differs from the value of most boards."""
     words = {module: describe_value(values.get(name)) for module, values in boards.items()}
     usual, count = Counter(words.values()).most_common(1)[0]
     if count == len(boards) or 2 * count <= len(boards):
         return []
-    fix = "set it in `odrivetool` and call `save_configuration()`, unless it is intended"
+    fix = "unless this is intended, set it in `odrivetool` and call `save_configuration()`"
     wanted = f"{usual}, as {count} others"
-    why = "a board with other settings behaves differently"
+    why = "the module may behave differently from the others"
     return [
         warning(*_split_name(module, name), found, wanted, fix, why)
         for module, found in words.items()
@@ -293,13 +294,13 @@ def _measured_rows(name: str, boards: Boards) -> list[Finding]:
         return []
     usual = median(found.values())
     rows = []
-    fix = "check its three phase wires; calibrate it again (docs/bring-up.md, section 5)"
+    fix = "check the three phase wires and calibrate again (docs/bring-up.md, section 5)"
     for (module, axis), value in found.items():
         subject, words = f"{module}.{axis}", describe_value(value)
         if not value > 0.0:
             calibrated = boards[module].get(f"{axis}.motor.is_calibrated")
             if calibrated:
-                why = "it gives no gains for the current loop"
+                why = "the gains of the current loop cannot be computed"
                 rows.append(wrong(subject, name, words, "> 0", fix, why))
         elif abs(value - usual) > MEASURED_SHARE * usual:
             why = "a loose or broken phase, or another motor"
@@ -314,7 +315,7 @@ def _supply_rows(boards: Boards) -> list[Finding]:
         if isinstance(value := values.get("vbus_voltage"), int | float)
     }
     usual = median(volts.values()) if volts else 0.0
-    fix = "check its own fuse, plug and wires: the boards share one supply"
+    fix = "check this board's fuse, plug and wires: all boards share one supply"
     return [
         warning(module, "supply", f"{value:.1f} V", f"about {usual:.1f} V, as the others", fix)
         for module, value in volts.items()

@@ -1,4 +1,4 @@
-"""Checks of this host: computer, the kernel's CAN interfaces, robot file, bus and keys."""
+"""Check this host: computer, CAN interfaces, robot file, bus and keys."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from tools.keys.inspection import inspect_keys
 MACHINE: Final = "machine"
 CPUS_MIN: Final = 2
 CPUS_FOR_1_KHZ: Final = 4
-"""Two processors carry the fleet at 500 Hz (docs/results.md)."""
+"""Minimum numbers of processors, at 500 Hz and at 1 kHz (docs/results.md)."""
 CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
-"""Clock sources that are read without a system call."""
+"""Clock sources that can be read without a system call."""
 ODRIVE_VENDOR: Final = "1209"
 ODRIVE_PRODUCTS: Final = tuple(f"0d3{i}" for i in range(1, 10))
-"""As in deploy/udev/91-odrive.rules."""
+"""USB ids of ODrives, as in deploy/udev/91-odrive.rules."""
 UDEV_FIX: Final = (
-    f"`sudo cp {FILES}/udev/91-odrive.rules /etc/udev/rules.d/`, then follow its header; "
-    "plug in again"
+    f"`sudo cp {FILES}/udev/91-odrive.rules /etc/udev/rules.d/`, then follow its header and "
+    "plug the boards in again"
 )
 LIMIT_FIX: Final = (
     "put `YOU - {} {}` in /etc/security/limits.d/xrl.conf and log in again, or set systemd's "
@@ -53,18 +53,18 @@ RTPRIO_FIX: Final = LIMIT_FIX.format("rtprio", 40, "RTPRIO", 40)
 MEMLOCK_FIX: Final = LIMIT_FIX.format("memlock", "unlimited", "MEMLOCK", "infinity")
 
 _TIMEX_BYTES: Final = 256
-"""At least the size of `struct timex` of <sys/timex.h>; with all zeros the call only reads."""
+"""At least the size of `struct timex`; `adjtimex` changes nothing if all bytes are zero."""
 _TIME_ERROR: Final = 5
-"""State of a clock that is not synchronised."""
+"""Return value of `adjtimex` if the clock is not synchronised."""
 
 
 Links = Mapping[str, Mapping[str, Any]]
 """Output of `ip` by interface."""
 
 QUEUE: Final = (32, 100)
-"""Valid lengths of a send queue, frames. deploy/udev/92-can.rules sets 64 and says why; the
-kernel's default is 10. More than 100 frames take longer than a joint service waits for a frame to
-be sent (`bus_watch.STUCK_MS`)."""
+"""Valid lengths of a send queue, frames. The kernel's default is 10; deploy/udev/92-can.rules sets
+64 and says why. Sending more than 100 frames takes longer than a joint service waits for a frame
+(`bus_watch.STUCK_MS`)."""
 _IP: Final = ("ip", "-details", "-json", "link", "show", "type", "can")
 _IP_S = 2.0
 _IFF_UP = 1
@@ -76,10 +76,10 @@ FILE: Final = "robot file"
 
 
 def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
-    """Check the computer; tests give another root of the file system."""
+    """Check the computer. Tests pass another root of the file system."""
     emulated = is_simulated(robot)
     rows = [_cpus(), _real_time(emulated=emulated), *_delays(root, emulated=emulated)]
-    # interpreted, the law's graphs only cost more time
+    # only a warning, because interpreted graphs are slower but correct
     graphs = graphs_of(robot)
     there = sum(library_of(graph).is_file() for graph in graphs)
     fix = f"install a C compiler `cc` and run `{command()} --config FILE`"
@@ -93,7 +93,7 @@ def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
 
 
 def usb_node_rows(root: Path) -> list[Finding]:
-    """Check that the ODrives on USB may be opened by this user."""
+    """Check that this user may open the ODrives on USB."""
     nodes = []
     for device in sorted((root / "sys/bus/usb/devices").glob("*")):
         vendor, product = _text(device / "idVendor"), _text(device / "idProduct")
@@ -101,7 +101,7 @@ def usb_node_rows(root: Path) -> list[Finding]:
             bus, number = _text(device / "busnum"), _text(device / "devnum")
             nodes.append(root / f"dev/bus/usb/{int(bus):03d}/{int(number):03d}")
     if not nodes:
-        fix = "plug in the USB cables; settings are read over USB"
+        fix = "plug in the USB cables: settings are read over USB"
         return [warning("USB", "ODrives", "none plugged in", "one for each module", fix)]
     closed = [str(node) for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
     found = f"{len(closed)} closed" if closed else f"{len(nodes)} open"
@@ -111,7 +111,7 @@ def usb_node_rows(root: Path) -> list[Finding]:
 def _cpus() -> Finding:
     cpus, fix = (
         os.sched_getaffinity(0),
-        "allow more processors (taskset, container), or use another computer",
+        "allow this process more processors (taskset, container), or use another computer",
     )
     right, left = (
         ",".join(map(str, sorted(scheduling.half_of(cpus, kind))))
@@ -123,7 +123,7 @@ def _cpus() -> Finding:
 
 
 def _delays(root: Path, *, emulated: bool) -> list[Finding]:
-    """Check causes of late cycles; for an emulated robot all rows are ok."""
+    """Check causes of late cycles; for an emulated robot every row is ok."""
     governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     governor = " and ".join(sorted({_text(file) for file in governors} - {""}))
     clock = _text(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
@@ -136,37 +136,37 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
     rows = (
         (governor in ("", "performance"), "frequency governor", governor or "unknown here",
          "performance", "`sudo cpupower frequency-set -g performance`",
-         "a processor at a low frequency is late"),
+         "cycles are late on a processor at a low frequency"),
         (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or similar",
-         "find in the kernel's log why it was dropped",
+         "find in the kernel's log why the kernel rejected tsc",
          "every read of the clock costs a system call"),
         (synchronised, "wall clock", "synchronised" if synchronised else "not synchronised",
          "synchronised", CLOCK_FIX,
-         "certificates and the merging of several hosts' records depend on it"),
+         "certificates and merged records of several hosts depend on it"),
         (may_lock, "locked memory", "allowed" if may_lock else locked, "allowed", MEMLOCK_FIX,
-         "a page that must be read from disk stops a loop"),
+         "a loop stops while a page is read from disk"),
         (areas <= 0, "swap", "none" if areas <= 0 else f"{areas} in use", "none",
          "`sudo swapoff -a`",
-         "a service that may not lock its memory stops for a page that was swapped out"),
+         "a service that may not lock its memory stops while a page is swapped in"),
         (awake, "idle processors", "stay awake" if awake else "sleep", "stay awake",
          f"`sudo cp {FILES}/udev/93-xrl.rules /etc/udev/rules.d/`, then follow its header",
-         "each cycle of a loop takes longer on a processor that was asleep"),
+         "a cycle takes longer on a processor that was asleep"),
         (pause_ms <= 0.0, "real-time pause", f"{pause_ms:g} ms" if pause_ms else "none", "none",
          f"`sudo cp {FILES}/sysctl/90-xrl.conf /etc/sysctl.d/ && sudo sysctl --system`",
-         "for this time each second the kernel stops a task that fills a processor: modules hold"),
+         "each second the kernel pauses a task that fills a processor, and modules hold"),
     )  # fmt: skip
     return [advised(good or emulated, MACHINE, *row) for good, *row in rows]
 
 
 def clock_is_synchronised() -> bool:
-    """Return True if chrony, systemd-timesyncd or another program keeps the wall clock right."""
+    """Return True if chrony, systemd-timesyncd or another program synchronises the wall clock."""
     state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
     return int(state) != _TIME_ERROR
 
 
 def _real_time(*, emulated: bool) -> Finding:
     what, wanted = "real-time priority", "SCHED_FIFO"
-    # try it and restore: limits, capabilities and control groups all matter
+    # try and restore, because limits, capabilities and control groups all matter
     with contextlib.suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(scheduling.TABLE["joint"].fifo))
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
@@ -193,7 +193,7 @@ def _libusb() -> Finding:
 
 
 def _text(path: Path) -> str:
-    """Return the contents of a small file of the kernel; "" if it does not exist."""
+    """Return the contents of a small kernel file, or "" if it does not exist."""
     try:
         return path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):
@@ -201,7 +201,7 @@ def _text(path: Path) -> str:
 
 
 def query_ip() -> Links:
-    """Return the output of `ip` for the CAN interfaces; nothing without that command."""
+    """Return the output of `ip` for the CAN interfaces, or nothing without `ip`."""
     try:
         output = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout
         return {link["ifname"]: link for link in json.loads(output or "[]") if "ifname" in link}
@@ -210,7 +210,7 @@ def query_ip() -> Links:
 
 
 def socketcan_rows(robot: RobotConfig, root: Path, links: Links) -> list[Finding]:
-    """Check every interface that the robot uses, by the file system and by `query_ip`."""
+    """Check each CAN interface of the robot, by files below `root` and by `query_ip`'s `links`."""
     rows = []
     for name in _interfaces_of(robot):
         flags = _text(root / "sys/class/net" / name / "flags")
@@ -237,7 +237,7 @@ def up_command(name: str) -> str:
 
 
 def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
-    """Judge an interface that is up by the output of `ip`; a missing value is not judged."""
+    """Judge an interface that is up by the output of `ip`, as far as it reports values."""
     data = link.get("linkinfo", {}).get("info_data", {})
     again = f"`sudo ip link set {name} down`, then {up_command(name)}"
     rows = []
@@ -250,33 +250,33 @@ def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
         errors, wanted = data.get("berr_counter", {}), _WELL.lower()
         counted = f" (errors sent {errors.get('tx', 0)}, received {errors.get('rx', 0)})"
         found = state.lower() + (counted if any(errors.values()) else "")
-        fix = "check: 120 ohm at both ends only, a ground wire, the same bit rate, short stubs"
-        why = "frames are resent and arrive late, or the bus goes off"
+        fix = "check 120 ohm at both ends only, the ground wire, equal bit rates, and short stubs"
+        why = "frames are resent and arrive late, or the controller goes bus-off"
         row = advised(state == _WELL, name, "controller", found, wanted, fix, why)
         if state in _OFF:
-            why = "it does not take part in the bus"
+            why = "the interface neither sends nor receives"
             row = wrong(name, "controller", found, wanted, again, why)
         rows.append(row)
     if "LISTEN-ONLY" in data.get("ctrlmode", ()):
         fix = f"`sudo ip link set {name} down`, then set it up with `listen-only off`"
         rows.append(wrong(name, "mode", "listen-only", "normal", fix, "nothing can be sent"))
     if data.get("restart_ms") == 0:
-        why = "after bus-off, for example from a short circuit, it stays down"
+        why = "after bus-off, for example from a short circuit, the interface stays down"
         rows.append(warning(name, "restart-ms", "0: off", "100", again, why))
     length = link.get("txqlen")
     if length is not None:
         low, high = QUEUE
         found, wanted = f"{length} frames", f"{low} to {high}"
         fix = f"install {FILES}/udev/92-can.rules, or `sudo ip link set {name} txqueuelen 64`"
-        why = "too short: it overflows at arming; too long: a plugged-in drive gets old frames"
+        why = "too short: it overflows at arming; too long: a reconnected drive gets old frames"
         good = low <= length <= high
         rows.append(advised(good, name, "send queue", found, wanted, fix, why))
-    # in one-shot mode the controller itself drops a frame that no node acknowledges
+    # in one-shot mode the controller drops unacknowledged frames, so no restart is needed
     return rows if "ONE-SHOT" in data.get("ctrlmode", ()) else rows + _restart_rows(root, name)
 
 
 def _restart_rows(root: Path, name: str) -> list[Finding]:
-    """Judge whether the joint services, or else this process, may restart an interface."""
+    """Judge whether the joint services (this process, if none runs) may restart an interface."""
     services = [
         path.parent for path in root.glob("proc/[0-9]*/cmdline") if "services.joint" in _text(path)
     ]
@@ -286,18 +286,18 @@ def _restart_rows(root: Path, name: str) -> list[Finding]:
     ]
     allowed = [int(one[1], 16) >> _CAP_NET_ADMIN & 1 for one in capabilities if one is not None]
     if len(allowed) < len(capabilities):
-        return []  # a process is gone, or this is not Linux
+        return []  # a process has ended, or this is not Linux
     fix = "run them from the unit of `xrl hosts`, or grant CAP_NET_ADMIN (docs/drives.md)"
-    why = "a dozen frames stay in the queue through a power cut, and reach the drive after it"
+    why = "a dozen frames survive a power cut in the queue, and then reach the drive"
     found = "allowed" if all(allowed) else "not allowed"
     what = "restart by the services"
     return [advised(all(allowed), name, what, found, "allowed", fix, why)]
 
 
 def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
-    """Check a robot file that has been read successfully."""
+    """Check a robot file that was read without errors."""
     count = len(robot.assumed)
-    found = f"{count} values assumed" if count else "all values measured"
+    found = f"{count} value{'s' * (count != 1)} assumed" if count else "all values measured"
     if count and process_table.is_simulated(robot):
         assumed = ok(FILE, "assumed", f"{found}; the emulated drives use them")
     elif count:
@@ -329,7 +329,7 @@ def joint_services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
 
 
 def endpoint_rows(robot: RobotConfig, run_dir: Path, *, fleet_is_up: bool) -> list[Finding]:
-    """Check that the endpoints of the bus are free, or used by the fleet."""
+    """Check that the endpoints of the bus are free, or in use by the fleet."""
     what = "endpoints"
     if fleet_is_up:
         up = services_up(robot, run_dir)
@@ -372,7 +372,7 @@ def security_rows(robot: RobotConfig) -> list[Finding]:
         if key.wrong:
             row = wrong("bus", what, key.wrong, "valid", "`xrl keys check`", "links fail")
         else:
-            why = "then new links fail; existing links stay"
+            why = "after expiry new links fail; existing links stay"
             found = key.warning or until
             row = advised(not key.warning, "bus", what, found, "valid", "`xrl keys renew`", why)
         rows.append(row)

@@ -1,11 +1,11 @@
-"""Exclusive access of bring-up verbs to the drives, real or emulated.
+"""Exclusive access of bring-up commands to the drives, real or emulated.
 
-A drive has one master. Before a verb writes to a drive, it checks whether a joint service holds
-the drive. While the verb works, no fleet can be started in the same run directory.
+A drive has one master. Before a command writes to a drive, it checks that no joint service holds
+the drive. While the command runs, no fleet can be started in the same run directory.
 
-Emulated drives are accessed by the same code as real ones: over the emulated CAN buses, and with
-the genuine `odrive` package over a stand-in for libusb. If no fleet is up, the simulator runs alone
-until the verb ends.
+Emulated drives are accessed by the same code as real ones: over emulated CAN buses, and with the
+genuine `odrive` package over a stand-in for libusb. If no fleet is up, the simulator runs alone
+until the command ends.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ from tools.fleet.run_dir import RunDir
 from tools.fleet.supervise import SupervisedFleet
 
 STARTED_S: Final = 15.0
-"""Timeout for the first frames of a simulator that was just started, s."""
+"""Timeout for the first frames after the simulator was started, s."""
 UP_S: Final = 3.0
-"""The same if a fleet is up, s: its simulator may be dead, or still starting for another verb."""
+"""Timeout for frames if a fleet is up, s: its simulator may be dead or still starting."""
 SETTLE_S: Final = 1.5
-"""Time until an emulated robot hangs still in its hoist, s."""
+"""Time until an emulated robot hangs at rest, s."""
 GONE: Final = (
-    "the drives were emulated for this command only, and the written values are gone; to keep "
+    "the drives were emulated for this command only, so the written values are lost; to keep "
     "them, run `xrl up --only simulator` first"
 )
 _POLL_S = 0.05
 
 
 def robot_file(flags: FleetRobotFlags) -> Path:
-    """Return the robot file of the fleet that is up in `--run-dir`, else `places.robot_file`.
+    """Return the robot file of the fleet in `--run-dir`; if none is up, `places.robot_file`.
 
     Raises:
-        ConfigError: no fleet is up, and the file found belongs to another user.
+        ConfigError: no fleet is up, and the file that was found belongs to another user.
         FleetError: `--config` is not the fleet's robot file.
     """
     run = RunDir(flags.run_dir)
@@ -71,14 +71,14 @@ def robot_file(flags: FleetRobotFlags) -> Path:
 
 
 def is_up(run_dir: Path) -> bool:
-    """Return True if a fleet has a process in this run directory."""
+    """Return True if a process of a fleet runs in this run directory."""
     return bool(procfs.fleet_pids(RunDir(run_dir).path))
 
 
 def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFleet | None:
-    """Return this user's fleet that has a joint service on a module's drive, or None.
+    """Return this user's fleet whose joint service uses a module's drive, or None.
 
-    It may be in any run directory: two fleets may use the same drive.
+    All run directories are searched, because another fleet may use the same drive.
     """
     drive = _drive_of(robot, module, RunDir(run_dir).path)
     for path in sorted(map(Path, procfs.fleets())):
@@ -94,7 +94,7 @@ def service_on(robot: RobotConfig, module: str, run_dir: Path) -> SupervisedFlee
 
 
 def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]:
-    """Return a unique id of a drive; an emulated drive's id includes its run directory."""
+    """Return a unique id of a drive; for an emulated drive it includes the run directory."""
     wiring = robot.module_named(module)
     place = str(run_dir) if is_simulated(robot) else ""
     if robot.joint_service.driver == "odrive_usb":
@@ -104,7 +104,7 @@ def _drive_of(robot: RobotConfig, module: str, run_dir: Path) -> tuple[str, ...]
 
 
 def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
-    """Raise FleetError if a module's joint service is up: a drive has one master."""
+    """Raise FleetError if a joint service uses a module's drive."""
     fleet = service_on(robot, module, run_dir)
     if fleet is not None:
         raise FleetError(
@@ -114,12 +114,12 @@ def refuse_service(robot: RobotConfig, module: str, run_dir: Path) -> None:
 
 
 def confirm(question: str, *, yes: bool) -> bool:
-    """Ask on the terminal; return True without asking if `--yes` was given."""
+    """Ask a yes-or-no question on the terminal; with `yes`, return True without asking."""
     if yes:
         return True
     if not sys.stdin.isatty():
         raise FleetError(
-            "no terminal to ask on; give --yes to move or change the robot without confirmation"
+            "no terminal to ask on; use --yes to move or change the robot without confirmation"
         )
     return input(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
@@ -134,8 +134,7 @@ def drives_within_reach(
 ) -> Iterator[bool]:
     """Make the drives accessible; yield True if the simulator was started for this.
 
-    Nothing is started for real drives. A simulator that is started hangs the robot higher by
-    `lifted`, m.
+    For real drives nothing is started. The simulator hangs the robot higher by `lifted`, m.
     """
     refuse_half_emulated(robot)
     if not is_simulated(robot):
@@ -143,7 +142,7 @@ def drives_within_reach(
         return
     simulator: SupervisedFleet | None = None
     if not is_up(run_dir):
-        # a light foot in the air on a damped drivetrain needs a finer step than a standing robot
+        # a light foot on a damped drivetrain needs a finer step in the air than on the floor
         words = ["--lifted", f"{lifted:g}", "--plant", "steps=4"] if lifted else []
         alone = FleetOptions(
             overrides={"simulator": words},
@@ -165,10 +164,7 @@ def drives_within_reach(
 
 
 def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
-    """Wait until an emulated robot's load cells send: its buses exist, and its loop runs.
-
-    The wait has a timeout, because the simulator may be dead.
-    """
+    """Wait until an emulated robot's load cells send, which shows that the simulator runs."""
     config = bus_config(robot, robot.harness.bus, RunDir(run_dir).path)
     until = time.monotonic() + seconds
     while time.monotonic() < until:
@@ -181,7 +177,7 @@ def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
 def no_fleet_meanwhile(robot: RobotConfig, run_dir: Path) -> Iterator[None]:
     """Prevent a fleet from being started on real drives in this run directory.
 
-    A fleet that is up stays up; an emulated robot's simulator holds the directory itself.
+    A fleet that is up stays up. For an emulated robot the simulator reserves the directory.
     """
     if is_simulated(robot) or is_up(run_dir):
         yield
@@ -204,14 +200,14 @@ def drives_to_ourselves(
     *,
     lifted: float = 0.0,
 ) -> Iterator[bool]:
-    """Make the drives accessible and prevent a new fleet; yield as `drives_within_reach`."""
+    """Make the drives accessible and prevent a new fleet; yield as `drives_within_reach` does."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(no_fleet_meanwhile(robot, run_dir))
         started = stack.enter_context(
             drives_within_reach(robot, config_path, run_dir, lifted=lifted)
         )
         if started:
-            progress("no fleet is up and the drives are emulated: starting their simulator")
+            progress("no fleet is up and the drives are emulated: starting the simulator")
             time.sleep(SETTLE_S)
         if is_simulated(robot) and robot.joint_service.driver == "odrive_usb":
             stack.enter_context(emulated_usb(run_dir))
@@ -220,15 +216,15 @@ def drives_to_ourselves(
 
 @contextlib.contextmanager
 def emulated_usb(run_dir: Path) -> Iterator[None]:
-    """Put the emulated drives on this process's USB, before anything imports `odrive`.
+    """Connect the emulated drives to this process's USB, before anything imports `odrive`.
 
-    The environment is restored afterwards; the stand-in stays loaded.
+    The environment is restored afterwards; the stand-in for libusb stays loaded.
     """
     with tempfile.TemporaryDirectory(prefix="xrl-usb-") as folder:
         usb_standin.load(usb_standin.build(Path(folder)))
         wanted = {
             usb_standin.VARIABLE: str(RunDir(run_dir).live / usb_standin.FOLDER),
-            # the package's cache of descriptors: keep emulated drives out of the home directory
+            # the package's cache: keep emulated drives out of the home directory
             "XDG_CACHE_HOME": str(Path(folder) / "cache"),
         }
         before = {name: os.environ.get(name) for name in wanted}
@@ -247,9 +243,9 @@ def emulated_usb(run_dir: Path) -> Iterator[None]:
 def boards_on_usb(
     robot: RobotConfig, run_dir: Path, modules: Iterable[str]
 ) -> Iterator[FoundBoards]:
-    """Connect to the boards of these modules over USB, or to the emulated boards.
+    """Connect to the real or emulated boards of modules over USB.
 
-    Modules without a serial number get no board.
+    Modules without a serial number are skipped.
     """
     serials = [robot.module_named(module).serial_number for module in modules]
     with contextlib.ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Findings of the doctor: rows with a verdict and a remedy; merged, counted and printed."""
+"""Findings of `xrl doctor`: rows with a verdict and a remedy, merged, counted and printed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FindingKind(StrEnum):
 
     OK = "ok"
     WARNING = "warning"
-    """The robot may run, but a person should know."""
+    """A person should know, but the robot may run."""
     WRONG = "wrong"
     """The robot must not be lowered from its hoist in this state."""
 
@@ -45,20 +45,20 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 Groups = dict[str, list[Finding]]
-"""Rows by their heading."""
+"""Rows by heading."""
 WIDE: Final = 110
-"""Minimum width for a column of remedies; on a narrower console they follow the table."""
+"""Minimum console width for a column of remedies; otherwise they follow the table."""
 COLOURS: Final = {
     FindingKind.OK: "green",
     FindingKind.WARNING: "yellow",
     FindingKind.WRONG: "bold red",
 }
 NAME_MAX: Final = 22
-"""Maximum length of a name on one line."""
+"""Maximum length of a name that is not broken into two lines."""
 NAMED_MAX: Final = 6
-"""Maximum number of findings named in the last line."""
+"""Maximum number of findings that the verdict line names."""
 ALL: Final = "all"
-"""Subject of a row that merges several equal ones."""
+"""Subject of a row that merges several rows."""
 
 _MODULES: Final = set(MODULES)
 _AXES: Final = {f"{module}.{axis}" for module in MODULES for axis in AXES}
@@ -70,31 +70,31 @@ def ok(subject: str, what: str, found: str, wanted: str = "") -> Finding:
 
 
 def warning(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
-    """Return a row that a person should know of."""
+    """Return a row that a person should know about."""
     return Finding(subject, what, found, wanted, FindingKind.WARNING, fix, why)
 
 
 def wrong(subject: str, what: str, found: str, wanted: str, fix: str, why: str = "") -> Finding:
-    """Return a row that keeps the robot in its hoist."""
+    """Return a row that forbids lowering the robot from its hoist."""
     return Finding(subject, what, found, wanted, FindingKind.WRONG, fix, why)
 
 
 def judged(good: bool, *row: str) -> Finding:
-    """Return an ok row if it is good, else a wrong row; `row` has the arguments of `wrong`."""
+    """Return an ok row if good, else a wrong row; `row` has the arguments of `wrong`."""
     return ok(*row[:4]) if good else wrong(*row)
 
 
 def advised(good: bool, *row: str) -> Finding:
-    """Return an ok row if it is good, else a warning; `row` has the arguments of `warning`."""
+    """Return an ok row if good, else a warning; `row` has the arguments of `warning`."""
     return ok(*row[:4]) if good else warning(*row)
 
 
 def merged(rows: Iterable[Finding]) -> list[Finding]:
-    """Return the rows, with those on the same matter merged.
+    """Merge rows of the same check; return the ok rows first.
 
-    Rows that are ok become one, from the smallest to the largest value. Rows that are not ok merge
-    where all six modules, all twelve axes, or both axes of a module are equal, so boards with
-    factory settings do not fill the table. Rows that are ok come first.
+    All ok rows of a check become one, with the range of their values. Other rows are merged only if
+    all six modules, all twelve axes or both axes of a module have the same finding, so boards with
+    factory settings do not fill the table.
     """
     alike: dict[tuple[str, ...], list[Finding]] = {}
     for row in rows:
@@ -119,13 +119,13 @@ def merged(rows: Iterable[Finding]) -> list[Finding]:
 
 
 def _anywhere(row: Finding) -> str:
-    """Return the remedy of a row, with MODULE in place of its module."""
+    """Return the remedy of a row, with MODULE in place of the module's name."""
     module = row.subject.partition(".")[0]
     return row.fix.replace(f" --module {module}", "").replace(module, "MODULE")
 
 
 def _one(group: list[Finding], subject: str) -> Finding:
-    """Return one row for several on the same matter, with the range of their values."""
+    """Return one row for several rows of a check, with the range of their values."""
     first = group[0]
     if len(group) == 1:
         return first
@@ -161,7 +161,7 @@ def report_of(groups: Groups) -> Report:
 
 
 def show(console: Console, groups: Groups, *, verbose: bool) -> None:
-    """Print the findings and the verdict in one line."""
+    """Print the findings, then the verdict line."""
     for title, rows in groups.items():
         console.print(_group(title, rows if verbose else merged(rows), console.width))
     report = report_of(groups)
@@ -201,14 +201,14 @@ def _group(title: str, rows: list[Finding], width: int) -> RenderableType:
         fix = "" if wide else row.fix
         if note := f"{fix} ({row.why})" if fix and row.why else fix or row.why:
             subjects.setdefault((row.what, note), []).append(row.subject)
-    # below the table, a text that several rows share appears once
+    # print a text that several rows share only once
     notes = [f"{', '.join(who)} {what}: {note}" for (what, note), who in subjects.items()]
     below = [Padding(Text(note), (0, 0, 0, 2), expand=False) for note in notes]
     return Group(table, *below, *([Text("")] if below else []))
 
 
 def _names(groups: Groups, verdict: FindingKind) -> str:
-    """Return the names of the first rows with a verdict, and the number of further rows."""
+    """Return the names of the first rows with a verdict, and the number of the others."""
     rows = [row for group in groups.values() for row in merged(group) if row.verdict is verdict]
     names = [
         # the last part of a setting's name

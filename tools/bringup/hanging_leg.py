@@ -1,6 +1,6 @@
 """Model of a hanging leg: inertia and gravity of its joints, and poses that gravity explains. Pure.
 
-It assumes the robot file's two equal masses of a leg, at knee and ankle. The hip's module is on the
+The model has the two equal masses of the robot file, at knee and ankle. The hip's module is on the
 torso, and an ankle's mass lies on its axis.
 """
 
@@ -21,42 +21,43 @@ from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULE_INDEX, MODULES, N_JOINTS, side_of
 
 INSIDE: Final = 0.12
-"""Distance inside its limits to which a joint is moved, as room for the motion, rad."""
+"""Minimum distance of a joint from its limits before a motion, rad."""
 HEAVY: Final = 1.0
-"""Inertia above which a joint that moves quickly shakes the hoist, kg m^2."""
+"""Inertia above which fast motion of a joint shakes the hoist, kg m^2."""
 RESTS_FROM: Final = 15.0
-"""Torque on a limp hip from which its leg rests on something, N m. The emulated robot has 9 if it
-hangs free, and 22 if its soles are on the floor."""
+"""Maximum torque on a limp hip whose leg hangs free, N m. The emulated robot has 9, and 22 with its
+soles on the floor."""
 BIAS_TORQUE: Final = 1.3
-"""Factor on the gravity torque at the bias, by the robot file."""
+"""Safety factor on the gravity torque at the bias, as computed from the robot file."""
 
 FRICTION: Final = 1.0
-"""Maximum dry friction and cogging that hold a joint off its balance, N m; the simulated robot has
-0.5. The thigh is short: 1 N m at hip and knee holds a knee 0.055 rad off."""
+"""Maximum dry friction and cogging that hold a joint off its equilibrium, N m; the simulated robot
+has 0.5. The thigh is short, so 1 N m at hip and knee holds a knee 0.055 rad off."""
 KNEE_ERROR: Final = 0.03
-"""Maximum error of a hanging knee's angle by the robot file, rad: 8 mm of its module's centre."""
+"""Maximum error of a hanging knee's angle as computed from the robot file, rad, if
+a module is 8 mm off."""
 HIP_ERROR: Final = 0.02
-"""Maximum error of the direction of a leg's centre of mass by the robot file, rad."""
+"""Maximum error of the direction to a leg's centre of mass as computed from the robot file, rad."""
 BEYOND: Final = 0.25
-"""Maximum distance of a joint beyond its limits, rad: the software's stops begin at the limits."""
+"""Maximum distance of a joint beyond its limits, rad; the mechanical stops are outside these."""
 STOP_FROM: Final = 0.05
-"""Distance inside its limit from which a joint may rest on a mechanical stop, rad."""
+"""Distance from a limit, rad, within which a joint may rest on a mechanical stop."""
 TILT_MAX: Final = 0.35
 """Maximum tilt of a hanging torso, rad."""
 FOLDED: Final = 1.0
 """Maximum angle of a hanging leg's thigh from the vertical, rad."""
 SWUNG: Final = 0.04
-"""Minimum swing of a joint to either side of its rest, rad: a few times its friction band."""
+"""Minimum swing of a joint to either side of its rest position, rad: beyond what friction holds."""
 
 
 def leg_of(*modules: str) -> tuple[str, ...]:
-    """Return all modules of these modules' legs."""
+    """Return all modules of the legs that contain these modules."""
     sides = {side_of(module) for module in modules}
     return tuple(name for name in MODULES if side_of(name) in sides)
 
 
 def why_resting(robot: RobotConfig, q: Mapping[str, Pair]) -> str:
-    """Return why a leg does not hang free at q, rad; "" if it may hang free.
+    """Return why a leg cannot hang free at q, rad, or "".
 
     A limp joint that gravity would move rests on something.
 
@@ -76,14 +77,14 @@ def why_resting(robot: RobotConfig, q: Mapping[str, Pair]) -> str:
 
 
 class HangingJoint(NamedTuple):
-    """Joint of a hanging leg, by the robot file."""
+    """Properties of a joint of a hanging leg, by the robot file."""
 
     inertia: float
-    """Inertia of the parts that hang on it, without its rotor, kg m^2."""
+    """Inertia of the parts below the joint, without its rotor, kg m^2."""
     gravity: float
-    """Stiffness that gravity gives it, N m/rad."""
+    """Stiffness from gravity, N m/rad."""
     bias: Pair
-    """Offset that brings its module well inside its limits, (phi, theta), rad."""
+    """Offset that moves its module inside the limits by `INSIDE`, (phi, theta), rad."""
 
     @property
     def held_torque(self) -> float:
@@ -94,7 +95,7 @@ class HangingJoint(NamedTuple):
 def hanging_joint(
     robot: RobotConfig, q: Mapping[str, Pair], module: str, axis: int
 ) -> HangingJoint:
-    """Return a joint of a leg that hangs at q, rad, by the robot file."""
+    """Return the properties of a joint of a leg that hangs at q, rad, by the robot file."""
     legs, at = HangingLegs(robot), _angles(q)
     joint, by = 2 * MODULE_INDEX[module] + axis, np.zeros(N_JOINTS)
     by[joint] = 1e-4
@@ -117,7 +118,7 @@ def _angles(q: Mapping[str, Pair]) -> NDArray[np.float64]:
 
 
 class Upright(NamedTuple):
-    """Direction of up, torso axes."""
+    """Measured direction of up."""
 
     up: Vector3
     within: float
@@ -130,13 +131,13 @@ class Upright(NamedTuple):
 
 
 def leg_scores(robot: RobotConfig, q_knee: Array, q_hip: Array, upright: Upright) -> Array:
-    """Return how much gravity contradicts each pose of a leg (n, m); up to 1 it explains the pose.
+    """Return scores (n, m) of a leg's poses; gravity explains a pose with a score of at most 1.
 
     Args:
         robot: masses, lengths and limits.
         q_knee: (n, 2) phi and theta of its knee, rad.
         q_hip: (m, 2) phi and theta of its hip, rad.
-        upright: direction of up; if it is unknown, the torso is assumed to hang.
+        upright: direction of up; if unknown, it is assumed within `TILT_MAX` of the torso's z.
     """
     allowed = TILT_MAX
     if upright.is_known:
@@ -147,19 +148,19 @@ def leg_scores(robot: RobotConfig, q_knee: Array, q_hip: Array, upright: Upright
 
 
 def implied_up(robot: RobotConfig, q_knee: Array, q_hip: Array) -> Array:
-    """Return the direction of up, torso axes (n, m, 3): a leg's centre of mass is below its hip."""
+    """Return up in torso axes (n, m, 3), if the leg's centre of mass is below its hip."""
     up: Array = -np.einsum("hij,kj->khi", rotations(q_hip), _leg_down(robot, q_knee))
     return up
 
 
 def angle(vectors: Array, other: Array) -> Array:
-    """Return the angles between unit vectors (..., 3) and one (3,), rad."""
+    """Return the angles between unit vectors (..., 3) and another one (3,), rad."""
     across = np.linalg.norm(np.cross(vectors, other), axis=-1)
     return np.asarray(np.arctan2(across, vectors @ other), float)
 
 
 def not_swung(swing: tuple[Pair, Pair], *, knee: bool) -> str:
-    """Return a direction in which a joint has not swung, or ""; a knee may hang on its stop."""
+    """Return a direction in which a joint swung too little, or "". A knee may hang on its stop."""
     (phi_low, theta_low), (phi_high, theta_high) = swing
     sides = {
         "phi, to its left": phi_low <= -SWUNG,
@@ -171,7 +172,7 @@ def not_swung(swing: tuple[Pair, Pair], *, knee: bool) -> str:
 
 
 def rotations(q: Array) -> Array:
-    """Return Ry(-theta) Rx(-phi) (n, 3, 3), which turns a link's axes into its parent's."""
+    """Return Ry(-theta) Rx(-phi) (n, 3, 3), which rotates from a link's axes to its parent's."""
     phi, theta = q[:, 0], q[:, 1]
     c, s, cp, sp = np.cos(theta), np.sin(theta), np.cos(phi), np.sin(phi)
     zero = np.zeros(len(q))
@@ -180,13 +181,13 @@ def rotations(q: Array) -> Array:
 
 
 def _knee_scores(robot: RobotConfig, q: Array) -> Array:
-    """Score knees (n, 2) by the torque that friction or a stop must hold; up to 1 is explained.
+    """Score knees (n, 2) by the torque that friction or a stop must hold; up to 1 is plausible.
 
-    The thigh swings as the knee bends, so a third of the knee's angle remains for the shin.
+    The thigh swings as the knee bends, so the shin moves by only a third of the knee's angle.
     """
     down = _leg_down(robot, q)
     l1, l2 = robot.geometry.l1, robot.geometry.l2
-    foot = -rotations(q)[:, :, 2]  # from the knee, in shins, thigh axes
+    foot = -rotations(q)[:, :, 2]  # ankle from the knee, in shin lengths, thigh axes
     theta = q[:, 1]
     axis_phi = np.column_stack([-np.cos(theta), np.zeros(len(theta)), -np.sin(theta)])
     arm = np.cross(foot, down)
@@ -203,16 +204,13 @@ def _knee_scores(robot: RobotConfig, q: Array) -> Array:
 
 
 def _weight(robot: RobotConfig) -> float:
-    """Return the stiffness that gravity gives a hanging leg at its hip, N m/rad."""
+    """Return the stiffness from gravity of a hanging leg at its hip, N m/rad."""
     l1, l2 = robot.geometry.l1, robot.geometry.l2
     return robot.mass.module * GRAVITY * (2.0 * l1 + l2)
 
 
 def _leg_down(robot: RobotConfig, q_knee: Array) -> Array:
-    """Return down in thigh axes (n, 3) for a leg that hangs from its hip, by its knee (n, 2).
-
-    Two equal masses, a module at the knee and one at the ankle; the hip's is on the torso.
-    """
+    """Return down in thigh axes (n, 3), for knees (n, 2) of a leg that hangs from its hip."""
     l1, l2 = robot.geometry.l1, robot.geometry.l2
     moment = np.array([0.0, 0.0, -2.0 * l1]) - l2 * rotations(q_knee)[:, :, 2]
     return np.asarray(moment / np.linalg.norm(moment, axis=1, keepdims=True), float)

@@ -1,18 +1,19 @@
-"""`xrl drive identify`: friction and reflected inertia, from small sines of a hanging leg. Pure.
+"""`xrl drive identify`: friction and reflected inertia from sine motions of a hanging leg. Pure.
 
-The drive's own loop follows sines of a few frequencies, one after the other. Where q moves steadily
-its Fourier series gives rate and acceleration without a filter's lag, and
+The drive's own loop follows sines of a few frequencies, one after another. Once the motion of q is
+steady, its Fourier series gives rate and acceleration without the lag of a filter, and
 
     tau = I q'' + d q' + c sign(q') + k (q - q_0) + tau_0
 
-is linear in inertia I, viscous friction d, dry friction c, gravity's stiffness k and tau_0; two
-frequencies separate I from k. I includes rotor and leg. The leg's part is subtracted by the masses
-of the robot file, which are known only to a few percent. At an ankle the leg's part is a foot; at a
-knee or hip it is fifty times the rotor.
+is linear in inertia I, viscous friction d, dry friction c, gravity's stiffness k, and tau_0. Two
+frequencies separate I from k. I includes rotor and leg. The leg's inertia is computed from the
+masses in the robot file, which are known only to a few percent, and subtracted. At an ankle the
+"leg" is a foot; at a knee or hip its inertia is fifty times the rotor's.
 
-A drive holds a target for a period, so its torque is a saw tooth. The fit uses its mean about a
-sample: half of the old target's torque and half of the new one's if the new target arrives at once
-(lockstep), and more of the old one's the later the new target arrives (over CAN about 1 ms).
+A drive holds a target for one period, so its torque is a saw tooth. The fit uses the mean torque
+around a sample. If the new target arrives at once (lockstep), this is half of the old target's
+torque and half of the new one's. The later the new target arrives (over CAN about 1 ms), the larger
+is the old target's share.
 """
 
 from __future__ import annotations
@@ -30,38 +31,39 @@ from tools.bringup.hanging_leg import HEAVY, HangingJoint
 from tools.bringup.motion import MotionPlan, Sample
 
 TONES: Final = ((0.4, 5), (1.0, 8), (2.0, 12))
-"""Hz and cycles of each tone; the first and last cycles fade in and out, and are not used."""
+"""Frequency, Hz, and cycles of each tone; its first and last cycles, which fade, are not used."""
 HEAVY_TONES: Final = ((0.2, 5), (0.5, 8))
 AMPLITUDE_MAX: Final = 0.06
-"""Maximum amplitude, rad; the lowest tone reaches it if nothing else limits it."""
+"""Maximum amplitude, rad."""
 TORQUE_SHARE: Final = 0.4
-"""Fraction of the torque limit that a tone may need for inertia and gravity."""
+"""Maximum torque of a tone for inertia and gravity, as a fraction of the torque limit."""
 K_P: Final = (400.0, 3000.0)
-"""Limits of k_p, N m/rad, for light and heavy joints. They are soft, because a sample's time error
-adds k_p times itself to the viscous friction."""
+"""Limits of k_p, N m/rad, for light and heavy joints. They are low, because a time error of the
+samples adds an error of k_p times this time to the viscous friction."""
 K_D: Final = (8.0, 35.0)
 """Limits of k_d, N m s/rad."""
 PER_INERTIA: Final = (1600.0, 50.0)
-"""k_p and k_d per inertia of a joint: 40 rad/s."""
+"""k_p and k_d per inertia of a joint; the bandwidth is 40 rad/s."""
 AFTER: Final = 0.25
-"""Share of the new target's torque: as if it arrived 0.5 ms after the sample."""
+"""Share of the new target's torque in the mean torque around a sample, assuming that the target
+arrives 0.5 ms after the sample."""
 TIME_SD: Final = 5e-4
-"""Standard deviation of that time, s."""
+"""Standard deviation of the target's arrival time, s."""
 YIELDS: Final = 0.05
-"""Uncertain fraction of an inertia: leg and hoist, on the joint's other side, yield."""
+"""Relative uncertainty of an inertia, because leg and hoist on the joint's other side yield."""
 DRY_SD: Final = 0.04
-"""Standard deviation of dry friction, N m, caused by cogging and play."""
+"""Standard deviation of dry friction due to cogging and play, N m."""
 MASS_SD: Final = 0.03
-"""Standard deviation of the leg's inertia in the robot file, as a fraction of it."""
+"""Relative standard deviation of the leg's inertia as computed from the robot file."""
 HALF_WIDTH: Final = 1.96
-"""Half the width of the 95 % interval, standard deviations."""
+"""Half-width of the 95 % interval, standard deviations."""
 HARMONICS: Final = 9
 MOVING: Final = 0.3
-"""Fraction of a tone's fastest rate; slower samples, where a joint sticks, are not used."""
+"""Fraction of a tone's maximum rate. Slower samples are not used, because the joint may stick."""
 
 
 class _Tone(NamedTuple):
-    """One sine, which swells in its first cycle and fades in its last."""
+    """One sine, which fades in during its first cycle and out during its last."""
 
     frequency_hz: float
     amplitude: float
@@ -90,7 +92,7 @@ class _Tone(NamedTuple):
 
 
 class _Tones(NamedTuple):
-    """Tones one after the other (`tools.bringup.motion.AxisCourse`)."""
+    """Tones one after another; implements `tools.bringup.motion.AxisCourse`."""
 
     tones: tuple[_Tone, ...]
 
@@ -118,7 +120,7 @@ class _Tones(NamedTuple):
         return 0.0, 0.0
 
     def begins(self) -> list[tuple[float, _Tone]]:
-        """Return when each tone begins, s."""
+        """Return each tone with its start time, s."""
         found, at = [], 0.0
         for tone in self.tones:
             found.append((at, tone))
@@ -130,10 +132,10 @@ SinePlan = MotionPlan[_Tones]
 
 
 class _JointFit(NamedTuple):
-    """Results of the sines, each a value and its standard deviation."""
+    """Results of the fit: values and their standard deviations."""
 
     inertia: tuple[float, float]
-    """Rotor and leg, kg m^2."""
+    """Inertia of rotor and leg, kg m^2."""
     viscous: tuple[float, float]
     """N m s/rad"""
     dry: tuple[float, float]
@@ -143,9 +145,9 @@ class _JointFit(NamedTuple):
 
 
 def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> SinePlan:
-    """Return sines that need a part of a torque, N m, for a joint first moved inside its limits.
+    """Return a plan of sines for a joint, which is first moved inside its limits.
 
-    The torque that holds the leg at its bias is added.
+    The torque limit is `torque`, N m, plus the torque that holds the leg at its bias.
     """
     inertia, gravity = joint.inertia + armature, joint.gravity
     tones = []
@@ -155,13 +157,13 @@ def plan_for(axis: int, torque: float, armature: float, joint: HangingJoint) -> 
         tones.append(_Tone(hertz, float(min(AMPLITUDE_MAX, most)), cycles))
     k_p = min(max(PER_INERTIA[0] * inertia, K_P[0]), K_P[1])
     k_d = min(max(PER_INERTIA[1] * inertia, K_D[0]), K_D[1])
-    # equal for both axes, so that both motors' own loops do all of it
+    # equal for both axes, so that the motors' own loops apply all of it
     soft = ((k_p, k_p), (k_d, k_d))
     return SinePlan(axis, _Tones(tuple(tones)), torque + joint.held_torque, joint.bias, soft)
 
 
 def fit_sines(samples: Sequence[Sample], plan: SinePlan) -> _JointFit | None:
-    """Fit the steady samples of a whole motion; return None if there are too few."""
+    """Fit the steady samples of a motion; return None if there are too few."""
     parts = []
     for along_s, tone in plan.course.begins():
         begin_s = plan.rest_s + along_s
@@ -198,8 +200,8 @@ def _steady(
 ) -> tuple[Array, Array, Array, Array]:
     """Return regressors (n, 5), torque (n,), cycle and weight of a tone's steady part.
 
-    A sample is weighted by the distance it stands for. Cogging slows a joint where it opposes the
-    motion, so weighting by time would count cogging as friction.
+    The weight of a sample is the distance that the joint covers during it. Cogging slows the joint
+    wherever it opposes the motion, so with equal weights it would count as friction.
     """
     t = np.array([s.t_s - begin_s for s in samples])
     q = np.array([s.q[axis] for s in samples])
@@ -224,8 +226,8 @@ def _steady(
 
 
 Verdict = Literal["change", "agrees", "measured", "not shown"]
-"""Respectively: the robot file's value is outside the interval; it is inside; the file has no such
-value; the interval is too wide for a verdict."""
+"""The robot file's value is outside the interval (change) or inside (agrees), the file has no value
+(measured), or the interval is too wide for a verdict (not shown)."""
 
 
 class Estimate(NamedTuple):
@@ -237,12 +239,12 @@ class Estimate(NamedTuple):
     """Value of the robot file, or None."""
     value: float
     half_width: float
-    """Half the width of the 95 % interval."""
+    """Half-width of the 95 % interval."""
     verdict: Verdict
 
     @property
     def digits(self) -> int:
-        """Decimals worth printing: a tenth of the interval."""
+        """Decimals to print, down to a tenth of the half-width."""
         return max(0, 1 - math.floor(math.log10(max(self.half_width, 1e-9))))
 
     def describes(self, truth: float) -> bool:
@@ -251,18 +253,18 @@ class Estimate(NamedTuple):
 
 
 class JointResult(NamedTuple):
-    """Results of one joint's sines."""
+    """Fit of one joint."""
 
     joint: str
     fit: _JointFit
     leg_inertia: float
-    """Inertia of the parts that hang on it, by the robot file, without its rotor, kg m^2."""
+    """Inertia of the parts below the joint by the robot file, without its rotor, kg m^2."""
 
 
 def estimates_of(results: Sequence[JointResult], robot: RobotConfig) -> list[Estimate]:
-    """Return the estimates; the last row is the rotors' inertia, one value for all joints.
+    """Return the estimates; the last row is the rotors' reflected inertia, equal for all joints.
 
-    Its verdict is "not shown" if half its interval is wider than half of the robot file's value.
+    Its verdict is "not shown" if its half-width exceeds half of the robot file's value.
     """
     armature, rows, rotors = robot.joint.armature, [], []
     for joint, fit, leg_inertia in results:

@@ -1,8 +1,8 @@
-"""Small motion of one axis and back, by the drive's own loop: plan, limits and guards. Pure.
+"""A small motion of one axis, out and back, by the drive's own loop: plan, limits and guards. Pure.
 
-Law, torque limiter and drive targets are the joint service's, so a sign that is right here is right
-there. Only the torque differs: the drive's own current limit keeps every motor below the requested
-torque, whatever happens to this process. `motion_runner` has the clock and the drives.
+Law, torque limiter and drive targets are those of the joint service, so a sign that is right here
+is right there. Only the torque limit differs: the drive's own current limit enforces the plan's,
+even if this process dies. `motion_runner` has the clock and the drives.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from shared.joints import AXES, KINDS
 from shared.robot.robot_model import HARD_STOP_MARGIN
 
 SETTLE_S: Final = 0.7
-"""Time for which the joint is held before the motion, and again afterwards, s."""
+"""Time for which the joint is held before and after the motion, s."""
 BIAS_S: Final = 2.0
 """Duration of the motion to the bias, s."""
 VEL_LIMIT: Final = 3.0
-"""Minimum speed limit of the motor, turn/s; a drive beyond its limit disarms (OVERSPEED)."""
+"""Minimum of the motor's speed limit, turn/s; beyond the limit a drive disarms (OVERSPEED)."""
 VEL_FACTOR: Final = 5.0
-"""Factor on the maximum requested rate, if that gives a higher speed limit."""
+"""Speed limit as a multiple of the maximum requested rate, if above `VEL_LIMIT`."""
 APART_MAX: Final = 0.15
-"""Maximum distance between reference and joint, rad: friction cannot explain more."""
+"""Maximum distance between reference and joint that friction can explain, rad."""
 OVER_TORQUE: Final = 0.98
-"""Fraction of the torque limit, in the sum of both axes, that counts as at the limit."""
+"""Fraction of the torque limit from which the sum of both axes counts as at the limit."""
 OVER_TORQUE_S: Final = 0.2
 SILENT_S: Final = 0.2
-"""Timeout without a sample, s: the joint's position is then unknown."""
+"""Timeout for a sample, s; afterwards the joint's position is unknown."""
 STRAYED_MAX: Final = 0.05
 """Maximum motion of a limp joint between the check and the arming, rad."""
 STOP_ROOM: Final = 0.02
-"""Allowance beyond a stop, rad: zero errors of the encoders, and a stop that yields."""
+"""Allowance beyond a stop for zero errors of the encoders and a yielding stop, rad."""
 
 
 class AxisCourse(Protocol):
-    """Motion of one axis about a position, where it starts and ends."""
+    """Motion of one axis that starts and ends at the same position."""
 
     @property
     def duration_s(self) -> float:
@@ -60,18 +60,18 @@ class AxisCourse(Protocol):
         """Maximum requested rate, rad/s."""
 
     def at(self, t_s: float) -> Pair:
-        """Return offset, rad, and rate, rad/s, at a time within its duration."""
+        """Return offset, rad, and rate, rad/s, at a time within the duration."""
 
 
 class Stay:
-    """No motion, without end, for a module that is held."""
+    """Course of a held module: no motion, for an unlimited time."""
 
     duration_s: float = math.inf
     span: Pair = pd_law.ZERO
     rate_max: float = 0.0
 
-    def at(self, t_s: float) -> Pair:  # noqa: ARG002 - at every time
-        """Return no offset and no rate."""
+    def at(self, t_s: float) -> Pair:  # noqa: ARG002 - the same at all times
+        """Return zero offset and zero rate."""
         return pd_law.ZERO
 
 
@@ -79,15 +79,15 @@ C = TypeVar("C", bound=AxisCourse)
 
 
 class MotionPlan(NamedTuple, Generic[C]):
-    """Course of one axis about the joint's present position, or about a bias from it."""
+    """Course of one axis about the joint's present position, plus a bias if given."""
 
     axis: int
     """0: phi, 1: theta."""
     course: C
     torque_limit: float
-    """N m at the joint: |tau_phi| + |tau_theta|."""
+    """Maximum of |tau_phi| + |tau_theta|, N m at the joint."""
     bias: Pair = pd_law.ZERO
-    """Offset to which the module is moved first, rad: a straight hanging knee is on its stop."""
+    """Offset to which the module is moved first, rad, because a hanging knee is on its stop."""
     own_gains: tuple[Pair, Pair] | None = None
     """k_p, N m/rad, and k_d, N m s/rad, of (phi, theta); None for the module's stand gains."""
 
@@ -112,7 +112,7 @@ class MotionPlan(NamedTuple, Generic[C]):
         return phi, theta
 
     def offset(self, t_s: float) -> tuple[Pair, Pair]:
-        """Return the offsets of (phi, theta), rad, and their rates, rad/s, at a time.
+        """Return the offsets of (phi, theta), rad, and their rates, rad/s.
 
         Args:
             t_s: time since the drive was armed, s.
@@ -144,16 +144,16 @@ class Sample(NamedTuple):
     tau: Pair
     """Requested torque at this sample, N m at the joint."""
     tau_before: Pair = pd_law.ZERO
-    """Torque at this sample by the previous target, which the drive had until now, N m."""
+    """Torque at this sample by the previous target, which was active until now, N m."""
 
 
 def limit_drives(robot: RobotConfig, plan: AnyPlan) -> RobotConfig:
-    """Return the robot with its drives limited to the plan's torque and speed.
+    """Return the robot with drives limited to the plan's torque, and well above its speed.
 
     A motor's torque is at most T / 2N, so that |tau_phi| + |tau_theta| <= T in the drive.
 
     Raises:
-        DriveError: the torque limit exceeds the robot's, or is too small to be set.
+        DriveError: the torque limit exceeds the robot's, or is below the torque of one ampere.
     """
     drive, joint = robot.drive, robot.joint
     per_ampere = 2.0 * joint.gear_ratio * drive.torque_constant
@@ -161,7 +161,7 @@ def limit_drives(robot: RobotConfig, plan: AnyPlan) -> RobotConfig:
     if not per_ampere <= plan.torque_limit <= most:
         raise DriveError(
             f"--torque-limit {plan.torque_limit:g}: must be {per_ampere:.1f} to {most:.1f} N m "
-            "(from one ampere to the limit of the robot file)"
+            "(from the torque of one ampere to the limit of the robot file)"
         )
     asked = plan.course.rate_max * joint.gear_ratio / (2.0 * math.pi)
     speed = min(drive.vel_limit, max(VEL_LIMIT, VEL_FACTOR * asked))
@@ -172,7 +172,7 @@ def limit_drives(robot: RobotConfig, plan: AnyPlan) -> RobotConfig:
 
 
 def within_stops(robot: RobotConfig) -> RobotConfig:
-    """Return the robot with its limits at the mechanism's stops: a hanging leg may rest on one."""
+    """Return the robot with its limits at the mechanical stops, where a hanging leg may rest."""
     limits, m = {}, HARD_STOP_MARGIN + STOP_ROOM
     for kind in KINDS:
         limit = getattr(robot.limits, kind)
@@ -188,21 +188,21 @@ def why_out_of_reach(robot: RobotConfig, module: str, plan: AnyPlan, q: Pair) ->
         if not low <= q[axis] <= high:  # so that a NaN is outside
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad, outside of {low:g} to {high:g} rad; move "
-                "it inside by hand, or correct its zero with `xrl drive zero`"
+                "it inside by hand, or correct the joint's zero with `xrl drive zero`"
             )
         ends = [q[axis] + offset for offset in plan.reach[axis]]
         beyond = [end for end in ends if not low <= end <= high]
         if beyond:
             return (
                 f"{AXES[axis]} is at {q[axis]:.3f} rad and would go to {beyond[0]:.3f}, outside of "
-                f"{low:g} to {high:g} rad; move it the other way (jog: --by with the other sign), "
+                f"{low:g} to {high:g} rad; move it the other way (jog: change the sign of --by), "
                 "or first move the joint by hand"
             )
     return ""
 
 
 def why_strayed(q: Pair, q_seen: Pair) -> str:
-    """Return how far a joint has moved since it was checked; "" if it has not."""
+    """Return a description of how far a joint moved since it was checked; "" if it did not."""
     strayed = max(abs(q[0] - q_seen[0]), abs(q[1] - q_seen[1]))
     if strayed <= STRAYED_MAX:
         return ""
@@ -210,10 +210,10 @@ def why_strayed(q: Pair, q_seen: Pair) -> str:
 
 
 class GuardedMotion:
-    """Law of one motion and its state, cycle by cycle.
+    """Law of one motion, run once per cycle, and its state.
 
     Attributes:
-        trouble: why the motion was stopped; "" if it was not.
+        trouble: reason for stopping the motion, or "".
         done: True if the motion is over.
         samples: samples so far.
     """
@@ -221,7 +221,7 @@ class GuardedMotion:
     def __init__(
         self, robot: RobotConfig, module: str, plan: AnyPlan, q: Pair, now_ns: int
     ) -> None:
-        """Start at q, rad, with a drive that was just armed; `robot` is from `limit_drives`."""
+        """Start at q, rad, with a newly armed drive; `robot` is from `limit_drives`."""
         stand = robot.stand_gains(module)
         self._k_p, self._k_d = plan.own_gains or (stand.k_p, stand.k_d)
         limits = limits_of(robot, module)
@@ -241,11 +241,11 @@ class GuardedMotion:
         self.samples: list[Sample] = []
 
     def step(self, now_ns: int, reading: DriveReading | None) -> MotorTarget | None:
-        """Return the drive's next target; None to keep the last one, or to idle the drive.
+        """Return the drive's next target; None to keep the last one, or if `trouble` is set.
 
         Args:
             now_ns: monotonic time.
-            reading: the newest sample, counted from the joint's zero; None without a new sample.
+            reading: the newest sample, counted from the joint's zero, or None.
         """
         t_s = (now_ns - self._start_ns) / NS_PER_S
         if reading is None:

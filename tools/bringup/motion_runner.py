@@ -1,8 +1,8 @@
-"""Runs a motion: checks, asks, arms, holds some modules, moves one, and always idles all.
+"""Run a motion: check, ask, arm, hold some modules, move one, and always idle all.
 
-A drive keeps a motion's small limits until a service arms it or it restarts. Until then, `xrl
-doctor` would report them as wrong, and `xrl drive configure --apply` would restart the board, which
-loses its zero. So the limits are restored at the end.
+A drive keeps the small limits of a motion until a service arms it or it restarts. Until then, `xrl
+doctor` would report them as wrong, and `xrl drive configure --apply` would restart the board and
+lose its zero. So the limits are restored at the end.
 """
 
 from __future__ import annotations
@@ -51,37 +51,38 @@ from tools.flags import MotionFlags
 from tools.terminal import Console, marked
 
 ANSWER_S: Final = 3.0
-"""Timeout for a drive's first answer, s: its link, and a heartbeat of both axes."""
+"""Timeout for a drive's first answer, s; it needs the link and a heartbeat of both axes."""
 NO_ANSWER: Final = "its drive does not answer; check its power and its bus (`xrl doctor`)"
 ARM_TRIES: Final = 3
 ARM_S: Final = 0.7
-"""Wait for closed loop after each attempt, s."""
+"""Timeout for entering closed loop after each attempt, s."""
 IDLE_TRIES: Final = 10
 IDLE_AT_LEAST: Final = 3
-"""Minimum number of idle commands: `Drive` does not report that one axis missed a command."""
+"""Minimum number of idle commands, because one axis may miss a command unnoticed."""
 IDLE_S: Final = 0.2
-"""Wait for heartbeats after each command, s."""
+"""Time to wait for heartbeats after each command, s."""
 NOT_IDLE: Final = (
-    "the drive does not report that it is idle: it may still hold; CUT ITS POWER before anybody "
+    "the drive does not report that it is idle, so it may still hold; CUT ITS POWER before anybody "
     "touches the joint"
 )
 READ_S: Final = 0.02
 PROGRESS_S: Final = 0.25
 OVERTIME_S: Final = 5.0
-"""Maximum time beyond a plan's duration, s; after it, the drive's samples are too rare."""
+"""Maximum time beyond a plan's duration, s; if exceeded, samples arrive too rarely."""
 STILL: Final = 0.004
-"""Maximum motion of a still leg in `STILL_FOR_S`, rad; an idle drive may report no rate."""
+"""Maximum motion of a leg at rest in `STILL_FOR_S`, rad; an idle drive may report no rate."""
 STILL_FOR_S: Final = 1.5
-"""More than half a swing of the leg."""
+"""Time for which a leg must rest, s: more than half a swing."""
 STILL_WAIT_S: Final = 60.0
 
 Clock = Callable[[], int]
 Progress = Callable[[Sample], None]
 
 LIFTED: Final = 0.2
-"""Extra height of the hung emulated robot for a leg's motion, feet clear of the floor, m."""
+"""Extra height of the hanging emulated robot, so that its feet are clear of the floor, m."""
 LIMITS_TIMES: Final = 3
-"""Times that limits are sent: CAN of firmware 0.5 cannot read them, and a frame may be lost."""
+"""Number of times that limits are sent: a frame may be lost, and firmware 0.5 cannot report
+limits over CAN."""
 _APART_S: Final = 0.02
 
 
@@ -90,13 +91,13 @@ class MotionResult(NamedTuple):
 
     samples: list[Sample]
     trouble: str
-    """Why it was stopped; "" if it was completed."""
+    """Reason why it was stopped, or ""."""
     not_idle: tuple[str, ...]
     """Modules whose drives do not report that they are idle."""
 
 
 class Interrupts:
-    """Signals that request a stop, deferred until the drives are idle.
+    """Signals that request a stop; deferred until the drives are idle.
 
     Attributes:
         number: the first signal that arrived, or 0.
@@ -107,7 +108,7 @@ class Interrupts:
 
     @property
     def words(self) -> str:
-        """Reason for stopping a motion; "" without a signal."""
+        """Reason for stopping a motion, or "" without a signal."""
         return f"stopped by {signal.Signals(self.number).name}" if self.number else ""
 
     @contextlib.contextmanager
@@ -126,7 +127,7 @@ class Interrupts:
 
 
 def await_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading | None:
-    """Return a drive's first reading that is not of a lost drive; None if it does not answer."""
+    """Return a drive's first valid reading, or None if the drive does not answer."""
     until = clock() + _ns(ANSWER_S)
     reading = drive.read(READ_S)
     while reading is None or reading.status in LOST_DRIVE:
@@ -137,7 +138,7 @@ def await_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading | None:
 
 
 def _idle_reading(drive: Drive, clock: Clock = now_ns) -> DriveReading:
-    """Return the first reading of an idle drive that is zeroed."""
+    """Return the first reading of a drive, which must be idle and zeroed."""
     reading = await_reading(drive, clock)
     if reading is None:
         raise DriveError(NO_ANSWER)
@@ -156,7 +157,7 @@ def hanging_angles(
     *,
     until_still: bool = True,
 ) -> dict[str, Pair] | None:
-    """Return modules' angles, (phi, theta), rad, once they hang still; None if interrupted."""
+    """Return the modules' angles (phi, theta), rad, once they rest; None if interrupted."""
     begin = still_since = clock()
     rest: dict[str, Pair] = {}
     while True:
@@ -190,18 +191,18 @@ def run_motion(
     progress: Progress,
     clock: Clock = now_ns,
 ) -> MotionResult:
-    """Hold all modules but one where they are, move that one, and always idle all.
+    """Move one module, hold the others where they are, and always idle all.
 
-    A held module that moves, or whose drive faults, stops the motion.
+    The motion stops if a held module moves or its drive faults.
 
     Args:
-        drives: idle, opened with the limits of `limit_drives`.
-        robot: as `limit_drives` made it.
-        module: the one to move.
-        plan: its motion.
-        q_seen: its angles when the person agreed, rad.
+        drives: idle drives, opened with the limits of `limit_drives`.
+        robot: result of `limit_drives`.
+        module: module to move.
+        plan: motion of this module.
+        q_seen: angles of this module when the person agreed, rad.
         interrupts: read in every cycle.
-        progress: receives a sample from time to time.
+        progress: receives a sample every `PROGRESS_S`.
         clock: monotonic, ns.
     """
     hold = MotionPlan(0, Stay(), plan.torque_limit)
@@ -227,7 +228,7 @@ def run_motion(
 
 
 class _GuardedModule:
-    """One drive and its law; the target is sent in every cycle, as by a joint service."""
+    """One drive and its law. As in a joint service, every cycle sends a target."""
 
     def __init__(
         self, name: str, drive: Drive, robot: RobotConfig, plan: AnyPlan, clock: Clock
@@ -241,9 +242,9 @@ class _GuardedModule:
         return [] if self.law is None else self.law.samples
 
     def arm(self, interrupts: Interrupts, q_seen: Pair | None = None) -> str:
-        """Arm the drive; return why it must not move from its position, or "".
+        """Arm the drive; return why it must not move, or "".
 
-        Held modules stay where they are, even outside their limits.
+        Without `q_seen` the module is held where it is, even outside its limits.
         """
         reading = arm(self.drive, interrupts, self.clock)
         if isinstance(reading, str):
@@ -259,7 +260,7 @@ class _GuardedModule:
 
     def step(self, reading: DriveReading | None) -> str:
         """Pass a sample to the law; return why the motion must stop, or ""."""
-        assert self.law is not None  # noqa: S101 - `arm` came first
+        assert self.law is not None  # noqa: S101 - `arm` set it
         target = self.law.step(self.clock(), reading)
         if target is not None:
             self.drive.write(target)
@@ -272,7 +273,7 @@ def _follow(
     interrupts: Interrupts,
     progress: Progress,
 ) -> str:
-    """Run all laws until the motion is done; return why it was stopped early, or ""."""
+    """Run all laws until the motion is done; return why it stopped early, or ""."""
     law, report_at_s, trouble = moved.law, 0.0, ""
     assert law is not None  # noqa: S101 - it is armed
     give_up_ns = moved.clock() + _ns(moved.plan.duration_s + OVERTIME_S)
@@ -309,12 +310,12 @@ def arm(drive: Drive, interrupts: Interrupts, clock: Clock) -> DriveReading | st
             if reading is not None and reading.status is DriveStatus.ERROR:
                 break
     if reading is None:
-        return "the drive has gone silent"
+        return "the drive sends no samples"
     return f"it does not arm: {reading.status.name}, error 0x{reading.error:x} (`xrl doctor`)"
 
 
 def _idle_all(modules: Sequence[_GuardedModule]) -> tuple[str, ...]:
-    """Idle all drives, even if one raises; return the modules that do not report idle."""
+    """Idle all drives, even if one raises; return the modules that are not idle."""
     left: list[str] = []
 
     def release(one: _GuardedModule) -> None:
@@ -328,7 +329,7 @@ def _idle_all(modules: Sequence[_GuardedModule]) -> tuple[str, ...]:
 
 
 def idle(drive: Drive, clock: Clock) -> bool:
-    """Idle both axes and wait until the drive reports idle; return False if it does not."""
+    """Idle both axes; return False if the drive does not report that it is idle."""
     for attempt in range(1, IDLE_TRIES + 1):
         drive.idle()
         until = clock() + _ns(IDLE_S)
@@ -336,7 +337,7 @@ def idle(drive: Drive, clock: Clock) -> bool:
         while clock() < until:
             reading = drive.read(READ_S)
             if reading is not None:
-                # an unzeroed drive may still be armed
+                # an unzeroed drive may be armed
                 is_idle = reading.status in (DriveStatus.IDLE, DriveStatus.ERROR)
         if is_idle and attempt >= IDLE_AT_LEAST:
             return True
@@ -348,7 +349,7 @@ def _ns(seconds: float) -> int:
 
 
 class Moved(NamedTuple, Generic[C]):
-    """Joint that completed its plan."""
+    """Result of a completed plan."""
 
     samples: list[Sample]
     plan: MotionPlan[C]
@@ -357,7 +358,7 @@ class Moved(NamedTuple, Generic[C]):
 
 
 class Stopped(NamedTuple):
-    """Motion that was not completed, or not begun."""
+    """Result of a motion that was not completed or not started."""
 
     why: str
     not_idle: tuple[str, ...] = ()
@@ -367,7 +368,7 @@ class Stopped(NamedTuple):
 
 
 def tell_stopped(stopped: Stopped, console: Console) -> int:
-    """Print why a motion ended, with dangers last; return the exit code."""
+    """Print why a motion stopped, then any danger; return the exit code."""
     if stopped.declined:
         console.print(stopped.why)
         return DECLINED_EXIT_CODE
@@ -378,13 +379,13 @@ def tell_stopped(stopped: Stopped, console: Console) -> int:
 
 
 def exit_if_interrupted(interrupts: Interrupts) -> None:
-    """Exit with a shell's exit code for a signal, if one arrived."""
+    """If a signal arrived, exit with the shell's code for it."""
     if interrupts.number:
         sys.exit(128 + interrupts.number)
 
 
 def refuse_services(robot: RobotConfig, modules: Sequence[str], run_dir: Path) -> None:
-    """Raise FleetError if a joint service is up in the leg of one of these modules."""
+    """Raise FleetError if a joint service uses a drive in the legs of these modules."""
     for name in leg_of(*modules):
         refuse_service(robot, name, run_dir)
 
@@ -399,17 +400,17 @@ def ask_and_move(
     *,
     alone: bool = False,
 ) -> Moved[C] | Stopped | None:
-    """Check a leg, ask, and move a joint; return how it ended, or None for a dry run.
+    """Check a leg, ask, and move a joint; return the result, or None for a dry run.
 
     Args:
-        flags: flags of the verb.
+        flags: flags of the command.
         robot: robot file.
         joint: module and axis.
-        plan_of: returns and prints the plan for modules at these angles, (phi, theta), rad.
+        plan_of: prints and returns the plan for given angles (phi, theta), rad, of the modules.
         interrupts: deferred while drives may be armed.
         console: for questions and progress.
-        alone: move the module alone, within its soft limits. Otherwise wait until its leg hangs
-            still, possibly on the mechanism's stops, and hold the leg's other modules.
+        alone: move only this module, within its limits. Otherwise wait until its leg hangs at rest,
+            possibly on mechanical stops, and hold the leg's other modules.
     """
     module, axis = joint
     modules = (module,) if alone else leg_of(module)
@@ -420,7 +421,7 @@ def ask_and_move(
     ):
         q = hanging_angles(drives, robot, interrupts, until_still=not alone)
     if q is None:
-        return Stopped("nothing was moved yet")
+        return Stopped("nothing was moved")
     plan = plan_of(q)
     bounded = robot if alone else within_stops(robot)
     limited = limit_drives(bounded, plan)
@@ -445,15 +446,15 @@ def ask_and_move(
             progress=lambda sample: show(_line(sample, plan, name)),
         )  # fmt: skip
     for one in modules:
-        # only for drives that report idle: an armed drive must not get full limits
+        # skip drives that may be armed: they must not get full limits
         if one in result.not_idle:
             continue
         try:
             give_back(robot, one, flags.run_dir)
         except XrlError as error:
             words = (
-                "[yellow]{}: the drive still has the limits of this motion ({}): until it is "
-                "armed by its service or restarted, `xrl doctor` reports them as wrong[/]"
+                "[yellow]{}: the drive still has the limits of this motion ({}); `xrl doctor` "
+                "reports them as wrong until its service arms the drive or the drive restarts[/]"
             )
             console.print(marked(words, one, error))
     if result.trouble or result.not_idle:
@@ -465,7 +466,7 @@ def ask_and_move(
 def open_drives(
     robot: RobotConfig, modules: Iterable[str], run_dir: Path
 ) -> Iterator[dict[str, Drive]]:
-    """Open modules' drives, which no other program may hold."""
+    """Open the drives of modules; no other program may hold them."""
     with contextlib.ExitStack() as stack:
         drives = {}
         for name in modules:
@@ -475,7 +476,7 @@ def open_drives(
 
 
 def give_back(robot: RobotConfig, module: str, run_dir: Path) -> None:
-    """Set the limits of an idle module's drive to the robot file's."""
+    """Restore the limits of an idle drive to those of the robot file."""
     over_usb = robot.joint_service.driver == "odrive_usb"
     (_over_usb if over_usb else _over_can)(robot, module, run_dir)
 
@@ -508,7 +509,10 @@ def _over_usb(robot: RobotConfig, module: str, run_dir: Path) -> None:
         board.write(wanted)
         kept = board.read(wanted)
     if not all(equal(kept.get(name), value) for name, value in wanted.items()):
-        raise DriveError(f"ODrive {serial}: it did not keep the limits")
+        raise DriveError(
+            f"ODrive {serial}: vel_limit and current_lim were written but do not read back; cycle "
+            "the power, or let a service arm the drive"
+        )
 
 
 def _line(sample: Sample, plan: AnyPlan, joint: str) -> Text:

@@ -1,7 +1,7 @@
-"""Blocking access to ODrives over USB, by the genuine `odrive` package.
+"""Blocking access to ODrives over USB with the genuine `odrive` package.
 
-The package runs on an asyncio loop in its own thread. Every call here is passed to that loop and
-awaited with a timeout. `UsbBus` needs libusb-1.0.
+The package runs on an asyncio loop in its own thread. Every call is passed to that loop and has a
+timeout. `UsbBus` needs libusb-1.0.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from shared.exceptions import DriveError
 from tools.bringup.boards import Board, FoundBoards, Value, describe_firmware, number
 
 FIND_S: Final = 3.0
-"""Timeout for boards to appear, s: discovery itself takes a few tenths."""
+"""Timeout for boards to appear, s; discovery takes a few tenths of a second."""
 CONNECT_S: Final = 15.0
-"""Timeout for a connection, s: an unknown board first sends its whole table of endpoints."""
+"""Timeout for a connection, s; an unknown board first sends its table of endpoints."""
 TRANSFER_S: Final = 5.0
 LEAVE_S: Final = 5.0
-"""Timeout from `save_configuration` until the board disconnects, s: it writes its flash first."""
+"""Timeout from `save_configuration` until the board disconnects, s; it first writes its flash."""
 RETURN_S: Final = 15.0
-"""Timeout until the board has reconnected, s."""
+"""Timeout for the board to reconnect, s."""
 
 _POLL_S = 0.02
 _ENDPOINT = "endpoint_ref"
@@ -49,12 +49,12 @@ class UsbBus:
     def __init__(self) -> None:
         self._manager = device_manager()
         self._present: dict[str, Any] = {}
-        """Boards that are plugged in now, by serial number; written by the package's loop."""
+        """Boards that are plugged in, by serial number; written by the package's loop."""
         self._boards: list[UsbBoard] = []
         self._subscription: Subscription = self.run(self._watch(), TRANSFER_S)
 
     def open(self, serial_numbers: Iterable[str], timeout_s: float = FIND_S) -> FoundBoards:
-        """Connect to boards by serial number, once all are plugged in or after the timeout."""
+        """Connect to boards by serial number, once all are plugged in or the timeout has passed."""
         wanted = [serial.upper() for serial in serial_numbers]
         results = self.run(self._connect_all(wanted, timeout_s), timeout_s + CONNECT_S + TRANSFER_S)
         boards: dict[str, Board] = {}
@@ -69,7 +69,7 @@ class UsbBus:
         return FoundBoards(boards, troubles, tuple(sorted(set(self._present) - set(wanted))))
 
     def close(self) -> None:
-        """Release every board; later calls on a board fail."""
+        """Release all boards; later calls on them fail."""
         with contextlib.suppress(DriveError):
             self.run(self._leave(), TRANSFER_S)
 
@@ -88,7 +88,7 @@ class UsbBus:
             task.cancel()
 
     async def connect_again(self, before: RuntimeDevice) -> RuntimeDevice:
-        """Wait until a restarting board has disconnected and reconnected, and connect to it."""
+        """Wait until a restarting board disconnects and reconnects, and connect to it."""
         serial = before.serial_number
         if not await self._until(lambda: self._present.get(serial) is not before.device, LEAVE_S):
             raise DriveError(
@@ -97,16 +97,16 @@ class UsbBus:
             )
         if not await self._until(lambda: serial in self._present, RETURN_S):
             raise DriveError(
-                f"ODrive {serial} did not come back within {RETURN_S:g} s after its restart; check "
+                f"ODrive {serial} did not reconnect within {RETURN_S:g} s after its restart; check "
                 "its cable and supply"
             )
         result = await self._connect(serial)
         if isinstance(result, str):
-            raise DriveError(f"ODrive {serial} restarted, but then: {result}")
+            raise DriveError(f"ODrive {serial} restarted, but cannot be connected: {result}")
         return result
 
     async def _watch(self) -> Subscription:
-        """Keep `_present` up to date from now on."""
+        """Start to keep `_present` up to date."""
         delegate: Any = DeviceManagerDelegate()
         delegate.on_found_device = self._on_found
         delegate.on_lost_device = self._on_lost
@@ -138,7 +138,7 @@ class UsbBus:
         return await asyncio.gather(*(self._connect(serial) for serial in serials))
 
     async def _connect(self, serial: str) -> RuntimeDevice | str:
-        """Return a board, or why it is not connected."""
+        """Return a board, or why it cannot be connected."""
         device = self._present.get(serial)
         if device is None:
             return "not plugged in"
@@ -152,7 +152,7 @@ class UsbBus:
 
     async def _leave(self) -> None:
         for board in self._boards:
-            with contextlib.suppress(Exception):  # it may be gone already
+            with contextlib.suppress(Exception):  # it may be disconnected already
                 self._manager.release_connection(board.device)
         self._boards.clear()
         self._manager.unsubscribe(self._subscription)
@@ -195,7 +195,7 @@ class UsbBoard:
         """See `Board`.
 
         Raises:
-            DriveError: also if the board lacks one of the endpoints; then nothing is written.
+            DriveError: also if the board lacks an endpoint; nothing is written then.
         """
         missing = [name for name in values if name not in self.device.properties]
         if missing:
@@ -251,14 +251,14 @@ class UsbBoard:
         return await self._bus.connect_again(self.device)
 
     def _named(self, value: Any) -> Value:
-        """Return a value as a `Value`: an endpoint becomes its name."""
+        """Convert a value to a `Value`: an endpoint becomes its name."""
         if isinstance(value, AsyncProperty):
-            return str(self.device.path_of(value._info))  # noqa: SLF001 - no public way
+            return str(self.device.path_of(value._info))  # noqa: SLF001 - no public access
         plain: Value = value
         return plain
 
 
 def describe(error: BaseException) -> str:
-    """Return an exception of the package as one line."""
+    """Describe an exception of the package in one line."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

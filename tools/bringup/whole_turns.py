@@ -1,23 +1,24 @@
-"""Recovers the whole turns that the motors have made since the joints' zeros. Pure.
+"""Recover the whole turns that the motors made since the joints were zeroed. Pure.
 
 After a loss of power, an absolute encoder reports its angle within the motor's turn, but not the
-number of turns. With the angles stored with a joint's zero, a lattice of poses is possible: one
-turn of one motor is pi / N, 0.18 rad, in phi and in theta at once, so the nearest other pose is
-0.25 rad away. Four kinds of evidence select the pose:
+number of turns. With the angles stored at the joint's zero, the possible poses form a lattice: one
+turn of one motor is pi / N, 0.18 rad, in both phi and theta, so the nearest other pose is 0.25 rad
+away. Four kinds of evidence select the pose:
 
 - Gravity. A leg that hangs free has its centre of mass below its hip at any tilt of the torso, so
-  its knee hangs straight or on its stop. The hip's pose then implies the direction of up, which an
-  IMU or a spirit level also gives. A leg that leans on something looks like a hanging leg that is
-  some turns off, so the leg must swing through its rest position.
-- The last rest. A joint has not moved if both its encoders read the same as at its last rest. Only
-  this shows that they are the same encoders: one that was exchanged or has slipped reads another
-  angle. For a joint that has moved, a person must confirm it.
-- A rough measurement by a person.
-- The limits of the joints. Gravity says nothing about an ankle, whose mass lies on its axis.
+  its knee hangs straight or on its stop. The hip's pose then implies the direction of up, which can
+  be compared with an IMU or a spirit level. A leg that leans on something looks like a hanging leg
+  that is some turns off, so the leg must swing through its rest position.
+- The last rest. If both encoders of a joint read the same as at its last rest, the joint has not
+  moved, and neither encoder was exchanged or slipped. If the joint has moved, a person must confirm
+  that its encoders were not touched.
+- A rough measurement by a person. An ankle that has moved needs one, because its mass lies on its
+  axis, so gravity says nothing about it.
+- The limits of the joints.
 
-A pose is accepted if friction and errors of the model explain it, and the second-best pose needs at
-least `CLEAR` times what they explain. Everything else is refused: a wrong turn makes the robot
-fall, a protractor takes a minute.
+A pose is accepted if friction and model errors explain its deviation, and the second-best pose
+deviates by at least `CLEAR` times what they explain. Otherwise the joint is refused, because with a
+wrong number of turns the robot falls, and measuring with a protractor takes only a minute.
 """
 
 from __future__ import annotations
@@ -36,22 +37,22 @@ from shared.joints import KINDS, SIDES, kind_of, side_of
 from tools.bringup.hanging_leg import BEYOND, Upright, angle, implied_up, leg_scores, not_swung
 
 CLEAR: Final = 1.5
-"""Minimum error of the second-best pose, as a multiple of the error that is explained."""
+"""Minimum error of the second-best pose, as a multiple of the explained error."""
 READS_ZERO: Final = 1e-4
-"""An encoder nearer to 0 than this, turns (less than two counts of 16384), may be stuck at 0."""
+"""Distance from 0 within which an encoder may be stuck at 0, turns: two counts of 16384."""
 UNMOVED: Final = 0.0015
 """Maximum change of both encoders' angles if a joint has not moved, turns: 0.3 mrad at the joint,
-more than an encoder's error changes with temperature. A joint that was moved reads this by chance
-once in 110 000 times."""
+more than temperature changes an encoder's error. A moved joint is this close by chance once in
+110 000 times."""
 BESIDE_MOVED: Final = 0.2
-"""Fraction of `UNMOVED` for a joint if another joint of its leg has moved: by chance once in 3
-million times."""
+"""Fraction of `UNMOVED` that is allowed if another joint of the leg has moved. A moved joint is
+this close by chance once in 3 million times."""
 STAYED: Final = 2.0
-"""Multiple of `UNMOVED` from which a motor has certainly moved."""
+"""Multiple of `UNMOVED` above which a motor has certainly moved."""
 MEASURED: Final = 0.08
 """Maximum error of a rough measurement, rad."""
 LEGS_APART: Final = 0.1
-"""Maximum difference between the two legs' directions of up, rad."""
+"""Maximum angle between the up directions found from the two legs, rad."""
 
 UNTOUCHED: Final = "no encoder, magnet, motor or encoder cable has been touched since its zero"
 SWING: Final = "let it swing (--swing)"
@@ -62,68 +63,68 @@ ROUGHLY: Final = (
 
 
 class ModuleEvidence(NamedTuple):
-    """Evidence for a module's turns; motor turns are counted from the joint's zero."""
+    """Evidence for the turns of a module's motors, which are counted from the joint's zero."""
 
     offsets: Pair
     """Motor turns, modulo 1, at which each encoder reads 0."""
     angles: Pair
-    """Present angles of the encoders within the turn, turns."""
+    """Present encoder angles within the turn, turns."""
     rest: Pair | None = None
-    """Motor turns at the joint's last rest, powered and zeroed; None if unknown."""
+    """Motor turns at the last rest of the powered and zeroed joint, or None."""
     about: Pair | None = None
-    """(phi, theta) measured by a person, rad."""
+    """Rough (phi, theta) measured by a person, rad."""
     swing: tuple[Pair, Pair] | None = None
-    """Lowest and highest (phi, theta) seen, relative to the present rest, rad."""
+    """Lowest and highest (phi, theta) of a swing, relative to the present rest position, rad."""
     untouched: bool = False
-    """True if a person confirms that encoders, magnets, motors and cables are those of the zero."""
+    """True if a person confirms that no part was touched since the zeroing (`UNTOUCHED`)."""
     stranger: str = ""
-    """Why board or encoders are not those of the zero, or ""."""
+    """Reason why board or encoders differ from those at the zero, or ""."""
 
 
 class Decision(NamedTuple):
-    """Decision about a module."""
+    """Decision on the pose of a module."""
 
     q: Pair | None
     """(phi, theta), rad; None if refused."""
     by: str
-    """Deciding evidence: "gravity", "unmoved" or "measured"; "" if refused."""
+    """Evidence that decided: "gravity", "unmoved" or "measured"; "" if refused."""
     second: float
-    """Distance to the second-best pose, rad; inf without a second pose."""
+    """Distance to the second-best pose, rad; inf if there is none."""
     times: float
     """Error of the second-best pose, as a multiple of the allowed error."""
     why: str
-    """Reason for the refusal, and remedy; "" if it was not refused."""
+    """Reason for a refusal, and remedy, or ""."""
 
 
 class _Candidates(NamedTuple):
-    """Poses of a module that its angles allow, and the decision by its own evidence."""
+    """Poses of a module that its encoders allow, and the decision by its own evidence."""
 
     poses: Array
     """(n, 2): phi, theta, rad."""
     own: Decision | None
-    """Decision by its own evidence, a pose or a refusal; None if gravity must decide."""
+    """Decision by all evidence except gravity; None if gravity must decide."""
 
     @property
     def unmoved(self) -> bool:
-        """True if its pose is that of its last rest, which must not contradict gravity."""
+        """True if its pose is that of its last rest; gravity must not contradict this pose."""
         return self.own is not None and self.own.by == "unmoved"
 
     @property
     def q(self) -> Array:
-        """Remaining poses, (1, 2) if its own evidence has decided, (0, 2) if it refuses."""
+        """Remaining poses: one if its own evidence decides, none if it refuses."""
         if self.own is None:
             return self.poses
         return np.empty((0, 2)) if self.own.q is None else np.array([self.own.q])
 
 
 def poses_of(evidence: ModuleEvidence, robot: RobotConfig, module: str) -> Array:
-    """Return every pose (n, 2), rad, that a module's angles and limits allow."""
+    """Return every pose (n, 2), rad, that a module's encoder angles and limits allow."""
     limit = getattr(robot.limits, kind_of(module))
     (phi_low, phi_high), (theta_low, theta_high) = limit.phi, limit.theta
     half = math.pi / robot.joint.gear_ratio
     first = [a + b for a, b in zip(evidence.offsets, evidence.angles, strict=True)]
     low, high = theta_low - 2.0 * BEYOND, theta_high + 2.0 * BEYOND
-    # of theta + phi and theta - phi, which are the motors' angles
+    # ranges of the motors' angles, theta + phi and theta - phi
     spans = ((low + phi_low, high + phi_high), (low - phi_high, high - phi_low))
     turns = [
         start + np.arange(math.ceil(low / (2.0 * half) - start), high / (2.0 * half) - start + 1e-9)
@@ -140,9 +141,9 @@ def poses_of(evidence: ModuleEvidence, robot: RobotConfig, module: str) -> Array
 def decide(
     robot: RobotConfig, evidence: Mapping[str, ModuleEvidence], upright: Upright
 ) -> dict[str, Decision]:
-    """Return the pose of each module, or why it is refused.
+    """Return the pose of each module, or the reason for its refusal.
 
-    Hips and knees hang; gravity decides a leg's knee and hip only if both are in the evidence.
+    Hips and knees must hang. Gravity can decide only if both knee and hip of a leg have evidence.
     """
     found: dict[str, Decision] = {}
     ups: dict[str, Array] = {}
@@ -151,8 +152,8 @@ def decide(
         ankle, knee, hip = (f"{kind}_{side}" for kind in ("ankle", "knee", "hip"))
         if ankle in evidence:
             found[ankle] = candidates[ankle].own or _refused(
-                f"{_since(evidence[ankle])}, and gravity says nothing about an ankle: "
-                f"{len(candidates[ankle].poses)} poses are possible; {ROUGHLY}"
+                f"{_since(evidence[ankle])}, and gravity says nothing about an ankle (possible "
+                f"poses: {len(candidates[ankle].poses)}); {ROUGHLY}"
             )
         if knee in evidence and hip in evidence:
             leg = _leg(robot, evidence, candidates, side, upright)
@@ -170,8 +171,8 @@ def decide(
         apart = float(angle(ups["right"], ups["left"]))
         if apart > LEGS_APART:
             why = (
-                f"the legs' directions of up differ by {apart:.2f} rad: one leans on something or "
-                "binds; let both hang free, and try again"
+                f"the up directions found from the two legs differ by {apart:.2f} rad: one leg "
+                "leans on something or binds; let both hang free, and try again"
             )
             legs = [f"{kind}_{side}" for side in SIDES for kind in ("knee", "hip")]
             found |= {name: _refused(why) for name in legs}
@@ -192,13 +193,13 @@ def _candidates(
 def _own(
     evidence: ModuleEvidence, poses: Array, gear_ratio: float, unmoved: float
 ) -> Decision | None:
-    """Decide by a module's own evidence; None if gravity must. `unmoved`: tolerance, turns."""
+    """Decide by a module's own evidence; None if gravity must. `unmoved` is a tolerance, turns."""
     if not len(poses):
         return _refused(f"its angles fit no pose inside its limits; {PROTRACTOR}")
     if any(min(angle, 1.0 - angle) < READS_ZERO for angle in evidence.angles):
         return _refused(
-            "an encoder reads exactly 0, like one without power or with a broken wire; "
-            "move the joint a little, and try again"
+            "an encoder reads exactly 0, as without power or with a broken wire; move the joint a "
+            "little, and try again"
         )
     if evidence.stranger:
         return _refused(f"{evidence.stranger}; {PROTRACTOR}")
@@ -221,8 +222,8 @@ def _leg(
 ) -> dict[str, Decision]:
     """Decide knee and hip of a leg, which gravity couples.
 
-    A knee that is a turn off moves the leg's centre of mass by 0.17 rad about the hip. No turn of
-    the hip compensates for this: 0.09 rad remain.
+    A knee that is one turn off moves the leg's centre of mass by 0.17 rad about the hip. Turns of
+    the hip can compensate for only a part of this: 0.09 rad remain.
     """
     names = knee, hip = f"knee_{side}", f"hip_{side}"
     own = {name: candidates[name].own for name in names}
@@ -282,7 +283,7 @@ def _leg(
 
 
 def _why_not_by_gravity(evidence: Mapping[str, ModuleEvidence], side: str, upright: Upright) -> str:
-    """Return the evidence that is missing to find a leg's turns by gravity, or ""."""
+    """Return why gravity cannot decide a leg's turns yet, and the remedy, or ""."""
     if not upright.is_known:
         return (
             "the direction of up is unknown: fit an IMU, or level the torso with a spirit level "
@@ -302,14 +303,14 @@ def _why_not_by_gravity(evidence: Mapping[str, ModuleEvidence], side: str, uprig
 
 
 def _measured(about: Pair, poses: Array) -> Decision:
-    """Decide by a rough measurement, rad."""
+    """Decide by a rough measurement `about`, rad."""
     off = np.linalg.norm(poses - np.array(about), axis=1)
     best = int(np.argmin(off))
     if off[best] > MEASURED:
         return _refused(
             f"the nearest pose that its encoders allow, {_words(poses[best])} rad, is "
             f"{off[best]:.2f} rad from the measurement, and at most {MEASURED:g} is allowed: "
-            f"measure again; if this remains, the stored zero is wrong: {PROTRACTOR}"
+            f"measure again; if this persists, the stored zero is wrong: {PROTRACTOR}"
         )
     phi, theta = map(float, poses[best])
     if len(poses) == 1:
@@ -320,10 +321,10 @@ def _measured(about: Pair, poses: Array) -> Decision:
 
 
 def _moved(evidence: ModuleEvidence, unmoved: float) -> str | None:
-    """Return None for a joint within `unmoved` turns of its rest, else the fault found, or "".
+    """Return None if a joint is within `unmoved` turns of its rest, else a fault, or "" for motion.
 
-    A joint that moves turns both motors. If only one encoder's angle has changed, or both encoders
-    read each other's angles, they were exchanged.
+    A joint that moves turns both motors. If only one encoder's angle changed, this encoder was
+    exchanged or slipped. If the encoders read each other's angles, their cables are swapped.
     """
     if evidence.rest is None:
         return ""
@@ -360,8 +361,8 @@ def _rested(rest: Pair, poses: Array, gear_ratio: float, unmoved: float) -> Deci
 
 
 def _since(evidence: ModuleEvidence) -> str:
-    """Return why its last rest does not decide."""
-    return "it has moved since its last rest" if evidence.rest else "no rest is stored for it"
+    """Return why the last rest of a module does not decide."""
+    return "it has moved since its last rest" if evidence.rest else "its last rest is not stored"
 
 
 def _refused(why: str) -> Decision:

@@ -1,8 +1,8 @@
 """Zeros stored for a loss of power, and the evidence for resuming them.
 
-The file is beside the robot file; an emulated robot's file is in its run directory and ends with
-the emulated drives. `xrl drive zero` and `xrl down` write it, never a service. The last rest in it
-may be outdated, so it is only evidence (`tools.bringup.whole_turns`).
+The file is beside the robot file. An emulated robot's file is in its run directory, and is lost
+with the emulated drives. `xrl drive zero` and `xrl down` write it, never a service. Its last rest
+positions may be outdated, so they are only evidence (`tools.bringup.whole_turns`).
 """
 
 from __future__ import annotations
@@ -45,48 +45,48 @@ IDENTITY: Final = tuple(
     for axis in (0, 1)
     for name in (*(f"encoder.config.{each}" for each in _CALIBRATION), "motor.config.pole_pairs")
 )
-"""Settings that a new calibration of an encoder changes, or that identify the encoder."""
+"""Settings that identify an encoder, or that its calibration changes."""
 
 IMU_WITHIN: Final = 0.02
 """Maximum error of an IMU, including its mounting, rad."""
 LEVEL_WITHIN: Final = 0.035
-"""Maximum error of a person who levels a torso with a spirit level, rad: 2 degrees."""
+"""Maximum error of a torso levelled with a spirit level, rad: 2 degrees."""
 IMU_S: Final = 1.0
 REST_WAIT_S: Final = 20.0
 """Timeout for released legs to stop swinging, s."""
 ROUND_S: Final = 0.8
-"""Period of the looks, s: it must not be half a swing of a leg, which takes 1 s."""
+"""Period of the readings, s; it must differ from half a swing of a leg, which takes 1 s."""
 
 Progress = Callable[[str], None]
 
 
 class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Identity of a board on USB and of its encoders."""
+    """Identity of a board on USB, and of its encoders."""
 
     serial_number: str
     calibration: dict[str, Value]
-    """The settings of `IDENTITY` that the board has."""
+    """Values of `IDENTITY`, except settings that the board lacks."""
 
 
 class ModuleZero(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One module's zero; motor turns are from q = 0, as the joint counts them."""
+    """Zero of one module; motor turns are counted from q = 0."""
 
     time: str
-    """Time of the zero, ISO 8601."""
+    """Time of zeroing, ISO 8601."""
     serial_number: str
-    """Serial number of the board, from the robot file."""
+    """Serial number of the board in the robot file."""
     motor_signs: Signs
     offsets: Pair
     """Motor turns, modulo 1, at which each encoder reads 0."""
     identity: Identity | None
     """None if the board was not on USB."""
     rest: Pair | None
-    """Motor turns at the last rest with the drive idle; None if unknown."""
+    """Motor turns at the last rest with an idle drive, or None."""
     rest_time: str
 
 
 class ZeroRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """File of the stored zeros."""
+    """Contents of the file of zeros."""
 
     gear_ratio: float
     encoder_counts_per_turn: int
@@ -94,7 +94,7 @@ class ZeroRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def path_of(robot: RobotConfig, config: Path, run_dir: Path) -> Path:
-    """Return where a robot's zeros are kept."""
+    """Return the path of a robot's file of zeros."""
     if is_simulated(robot):
         return RunDir(run_dir).path / "zeros.json"
     return config.with_name(f"{config.stem}.zeros.json")
@@ -127,7 +127,7 @@ def read_zeros(path: Path, robot: RobotConfig) -> ZeroRecord:
 
 
 def write_zeros(path: Path, record: ZeroRecord) -> None:
-    """Write the zeros atomically, and flush them to the disk."""
+    """Write the zeros atomically, and flush them to disk."""
     try:
         with atomic_file(path, lasting=True) as file:
             file.write(msgspec.json.format(msgspec.json.encode(record)) + b"\n")
@@ -141,7 +141,7 @@ def write_zeros(path: Path, record: ZeroRecord) -> None:
 def zeroed(
     robot: RobotConfig, module: str, q: Pair, angles: Pair, identity: Identity | None
 ) -> ModuleZero:
-    """Return the zero of a module that rests at q, rad, its encoders at these angles, turns."""
+    """Return the zero of a module that rests at q, rad, with its encoders at `angles`, turns."""
     turns, now = motor_from_joint(q, robot.joint.gear_ratio), timestamp()
     wiring = robot.module_named(module)
     return ModuleZero(
@@ -156,7 +156,7 @@ def zeroed(
 
 
 def with_rests(record: ZeroRecord, rests: Mapping[str, Pair | None]) -> ZeroRecord:
-    """Return the zeros with new rests, motor turns; None is unknown."""
+    """Return the zeros with new rest positions in motor turns; None for an unknown one."""
     now, modules = timestamp(), dict(record.modules)
     for name, rest in rests.items():
         modules[name] = msgspec.structs.replace(modules[name], rest=rest, rest_time=now)
@@ -166,12 +166,12 @@ def with_rests(record: ZeroRecord, rests: Mapping[str, Pair | None]) -> ZeroReco
 def why_stranger(
     zero: ModuleZero, robot: RobotConfig, module: str, identity: Identity | None
 ) -> str:
-    """Return why a board or its encoders are not those of a zero, or ""."""
+    """Return why a board or its encoders differ from those at the zero, or ""."""
     wiring = robot.module_named(module)
     if wiring.serial_number.upper() != zero.serial_number:
         return (
-            f"the robot file has board {wiring.serial_number or 'without number'}, but the zero "
-            f"is of board {zero.serial_number or 'without number'}"
+            f"the robot file has board {wiring.serial_number or '(no serial number)'}, but the "
+            f"zero is of board {zero.serial_number or '(no serial number)'}"
         )
     if wiring.motor_signs != zero.motor_signs:
         return f"motor_signs are {wiring.motor_signs}, but were {zero.motor_signs} at its zero"
@@ -179,7 +179,8 @@ def why_stranger(
         return ""
     if identity.serial_number != zero.identity.serial_number:
         return (
-            f"it is board {identity.serial_number}, not {zero.identity.serial_number} of its zero"
+            f"it is board {identity.serial_number}, but its zero is of board "
+            f"{zero.identity.serial_number}"
         )
     for name, before in zero.identity.calibration.items():
         now = identity.calibration.get(name)
@@ -189,14 +190,14 @@ def why_stranger(
 
 
 def timestamp() -> str:
-    """Return the local time with its offset, ISO 8601."""
+    """Return the local time with its UTC offset, ISO 8601."""
     return time.strftime("%Y-%m-%dT%H:%M:%S%z")
 
 
 def drives_of(
     robot: RobotConfig, modules: Iterable[str], run_dir: Path
 ) -> AbstractContextManager[dict[str, Drive]]:
-    """Open modules' drives in their own count, without the mark of a zero."""
+    """Open the drives of modules in the drives' own counts, without the mark of a zero."""
     unmarked = msgspec.structs.replace(robot.drive, zero_mark_turns=0.0)
     return open_drives(msgspec.structs.replace(robot, drive=unmarked), modules, run_dir)
 
@@ -204,9 +205,10 @@ def drives_of(
 def looks_at_rest(
     drives: Mapping[str, Drive], robot: RobotConfig
 ) -> tuple[dict[str, DriveLook], set[str]]:
-    """Look at drives until their joints rest, for at most `REST_WAIT_S`; return which do not.
+    """Observe drives until their joints rest, at most for `REST_WAIT_S`.
 
-    A swinging leg is slow where it reverses, so its encoders must read the same after `ROUND_S`.
+    Returns the observations, and the modules that still move. A swinging leg is slow where it
+    reverses, so its encoders must read the same after `ROUND_S`.
     """
     until = time.monotonic() + REST_WAIT_S
     before: dict[str, DriveLook] = {}
@@ -226,7 +228,7 @@ def looks_at_rest(
 
 
 def same_angles(seen: DriveLook, before: DriveLook | None, within: float) -> bool:
-    """Return True if two looks show the same angles within a tolerance, turns."""
+    """Return True if two observations have the same encoder angles within a tolerance, turns."""
     if before is None or seen.angles is None or before.angles is None:
         return False
     off = [a - b for a, b in zip(seen.angles, before.angles, strict=True)]
@@ -236,9 +238,9 @@ def same_angles(seen: DriveLook, before: DriveLook | None, within: float) -> boo
 def identities(
     robot: RobotConfig, run_dir: Path, modules: Collection[str], progress: Progress
 ) -> dict[str, Identity]:
-    """Return the identities of the boards that are on USB; the boards are only read.
+    """Read the identities of the boards that are on USB.
 
-    An emulated robot's boards are on USB only if its services use USB.
+    Emulated boards are on USB only if the services use USB.
     """
     if is_simulated(robot) and robot.joint_service.driver != "odrive_usb":
         return {}
@@ -262,11 +264,11 @@ def identities(
 
 
 def why_not_kept(robot: RobotConfig, seen: DriveLook, identity: Identity | None) -> str:
-    """Return why a zero cannot be stored for a loss of power; "" if it can."""
+    """Return why a zero cannot be stored for a loss of power, or ""."""
     if seen.angles is None:
         return (
-            "its drive does not report the angle within the turn, like firmware 0.6 over CAN; zero "
-            "it with a protractor after each loss of power"
+            "its drive does not report the angle within the turn, as with firmware 0.6 over CAN; "
+            "zero it with a protractor after each loss of power"
         )
     modes = [] if identity is None else [
         value for name, value in identity.calibration.items() if name.endswith("config.mode")
@@ -277,7 +279,7 @@ def why_not_kept(robot: RobotConfig, seen: DriveLook, identity: Identity | None)
 
 
 def upright(robot: RobotConfig, run_dir: Path, *, level: bool) -> Upright:
-    """Return the direction of up: from the IMU, or from the person who has levelled the torso.
+    """Return the direction of up from the IMU, or from a person who levelled the torso.
 
     Raises:
         DriveError: the fitted IMU sends no valid attitude.
@@ -296,7 +298,7 @@ def upright(robot: RobotConfig, run_dir: Path, *, level: bool) -> Upright:
         sensor.close()
     if not reading.valid:
         raise DriveError(
-            "the IMU sends no valid attitude; see `xrl doctor`, or set imu.fitted = false, level "
+            "the IMU sends no valid attitude; see `xrl doctor`. Or set imu.fitted = false, level "
             "the torso with a spirit level and add --level"
         )
     return Upright(reading.up, IMU_WITHIN)
@@ -326,9 +328,9 @@ def evidence_of(
 def store_rests(
     robot: RobotConfig, config: Path, run_dir: Path, modules: Collection[str], progress: Progress
 ) -> int:
-    """Store where modules rest once their legs have stopped swinging; return how many rest.
+    """Wait until modules rest, and store their rest positions; return how many were stored.
 
-    A module that does not rest, or whose zero is not the stored one, has its rest erased.
+    The stored position of a module that does not rest, or that has another zero, is erased.
 
     Raises:
         DriveError: no zero is stored, or the file cannot be written.
@@ -353,9 +355,9 @@ def store_rests(
 
 
 def rests_after_down(config: Path, run_dir: Path, services: Iterable[str]) -> str:
-    """Store where the modules of a stopped fleet rest, on real drives; return the result as text.
+    """Store the rest positions of a stopped fleet's real modules; return a description.
 
-    The text is "" if nothing can be stored: emulated drives are gone, or there are no zeros.
+    The result is "" if the drives were emulated or no zeros are stored.
     """
     modules = [name for name in services if name in MODULES]
     lines: list[str] = []
@@ -372,7 +374,7 @@ def rests_after_down(config: Path, run_dir: Path, services: Iterable[str]) -> st
 
 
 def not_its_zero(seen: DriveLook, offsets: Pair, gear_ratio: float) -> str:
-    """Return why a drive's zero is not the stored one; "" if it is, up to whole turns."""
+    """Return why a drive's zero, apart from whole turns, is not the stored one, or ""."""
     if not seen.zeroed:
         return "it is unzeroed"
     if seen.angles is None:

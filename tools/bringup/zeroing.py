@@ -1,8 +1,9 @@
-"""Writes a joint's position to its drive (check, write, read back), and watches legs swing.
+"""Write a joint's position to its drive (check, write, read back), and watch legs swing.
 
-Positions here are in the drive's own count; `services.joint.drivers.wired_drive` says why a motor
-at q = 0 gets a mark instead of 0. The functions take a `Drive` without that wrapper, because the
-wrapper would report an armed drive that lost its zero only as unzeroed.
+Positions are in the drive's own count; `services.joint.drivers.wired_drive` says why a motor at
+q = 0 reads a mark instead of 0. The functions need drives opened without the mark
+(`zero_record.drives_of`): with it, an armed drive without a zero would be reported only as
+unzeroed.
 """
 
 from __future__ import annotations
@@ -26,21 +27,21 @@ from tools.bringup.hanging_leg import not_swung
 from tools.bringup.motion_runner import NO_ANSWER, STILL, STILL_FOR_S, await_reading
 
 LOOK_S: Final = 0.3
-"""Time for which a joint is watched before it counts as still, s."""
+"""Time for which a joint is observed, s."""
 STILL_RATE: Final = 0.05
-"""Maximum rate of a still joint, rad/s; one encoder count in 1 ms is 0.02 rad/s at the joint."""
+"""Maximum rate of a joint at rest, rad/s; one count of both encoders in 1 ms is 0.02 rad/s."""
 MOVED_MAX: Final = 0.005
-"""Maximum motion of a still joint in `LOOK_S`, rad."""
+"""Maximum motion of a joint at rest in `LOOK_S`, rad."""
 WITHIN: Final = 0.002
-"""Maximum difference between the position read back and the one written, rad."""
+"""Maximum difference between written position and position read back, rad."""
 HELD_WITHIN: Final = 0.03
-"""The same if its joint service has armed the drive since, rad: the joint sags a little."""
+"""`WITHIN` for a drive that a joint service has armed meanwhile: the joint sags a little."""
 TAKEN_S: Final = 0.1
-"""Samples within this time after a write may be older than the write, s."""
+"""Time after a write during which samples may be older than the write, s."""
 SET_S: Final = 0.5
-"""Timeout of one attempt to read back right, s; frames may get lost, so there are several."""
+"""Timeout for a correct position after one write, s; frames may be lost, so writes are repeated."""
 SETTLED_S: Final = 0.1
-"""Time for which the drive is read before a position is written, s."""
+"""Time for which the drive is read before a write, s."""
 ATTEMPTS: Final = 4
 _READ_S: Final = 0.05
 
@@ -57,12 +58,12 @@ Swing = tuple[Pair, Pair]
 
 
 class Back(NamedTuple):
-    """Position read back."""
+    """Position read back from a drive."""
 
     q: Pair
     """(phi, theta), rad."""
     armed: bool
-    """True if its joint service has armed the drive, which is then not written again."""
+    """True if a joint service has armed the drive: no position must be written to it again."""
 
 
 class DriveLook(NamedTuple):
@@ -72,7 +73,7 @@ class DriveLook(NamedTuple):
     """Status regardless of the zero: ARMED if the drive is in closed loop."""
     zeroed: bool
     q: Pair
-    """(phi, theta) by the drive's zero, rad; meaningless if it is unzeroed."""
+    """(phi, theta) by the drive's zero, rad; meaningless for an unzeroed drive."""
     speed: float
     """Maximum speed of the joint, rad/s."""
     moved: float
@@ -80,13 +81,13 @@ class DriveLook(NamedTuple):
     error: int
     """`AxisError` bits of both axes."""
     angles: Pair | None = None
-    """Angles of its encoders within the turn, turns; None if the drive does not report them."""
+    """Encoder angles within the turn, turns; None if the drive does not report them."""
     q_there: Pair = (0.0, 0.0)
-    """`q` when the encoders were at these angles: a joint that is still may creep."""
+    """`q` at the time of `angles`: even a joint at rest may creep."""
 
     @property
     def is_moving(self) -> bool:
-        """True if it moved while it was watched."""
+        """True if the joint moved while it was observed."""
         return self.speed > STILL_RATE or self.moved > MOVED_MAX
 
 
@@ -96,7 +97,7 @@ SILENT: Final = DriveLook(
 
 
 def look(drive: Drive, robot: RobotConfig) -> DriveLook:
-    """Observe a drive, in its own count, for `LOOK_S`, once it answers."""
+    """Observe a drive in its own count for `LOOK_S`, once it answers."""
     reading = await_reading(drive)
     if reading is None:
         return SILENT
@@ -128,7 +129,7 @@ def look(drive: Drive, robot: RobotConfig) -> DriveLook:
 
 
 def refusal(seen: DriveLook) -> str:
-    """Return why a drive cannot be zeroed now; "" if it can."""
+    """Return why a drive cannot be zeroed now, or ""."""
     if seen.status in LOST_DRIVE:
         return NO_ANSWER
     if seen.status is DriveStatus.ARMED:
@@ -144,7 +145,7 @@ def refusal(seen: DriveLook) -> str:
 
 
 def why_outside(robot: RobotConfig, module: str, q: Pair) -> str:
-    """Return which angle of (phi, theta), rad, is outside of a module's limits, or ""."""
+    """Return which of phi and theta, rad, is outside of a module's limits, or ""."""
     limit = getattr(robot.limits, kind_of(module))
     for axis, angle, (low, high) in zip(("phi", "theta"), q, (limit.phi, limit.theta), strict=True):
         if not low <= angle <= high:  # so that a NaN is outside
@@ -153,16 +154,16 @@ def why_outside(robot: RobotConfig, module: str, q: Pair) -> str:
 
 
 def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
-    """Write both motors' positions for joint angles q, rad, to an idle drive in its own count.
+    """Write the motor positions for joint angles q, rad, to an idle drive in its own count.
 
     Returns:
-        The position read back, right or not (`is_right`); None if no sample arrived.
+        Position read back, correct or not (`is_right`); None if no sample arrived.
     """
     mark, gear_ratio = robot.drive.zero_mark_turns, robot.joint.gear_ratio
     m1, m2 = motor_from_joint(q, gear_ratio)
     back: Back | None = None
     for _ in range(ATTEMPTS):
-        # empty the receive queue first: a bus with frames waiting there accepts none to send
+        # empty the receive queue first: while frames wait there, the bus accepts none to send
         until = time.monotonic() + SETTLED_S
         while time.monotonic() < until:
             drive.read(_READ_S)
@@ -182,7 +183,7 @@ def zero(drive: Drive, q: Pair, robot: RobotConfig) -> Back | None:
 
 
 def is_right(back: Back | None, q: Pair) -> bool:
-    """Return True if the position read back is the one written."""
+    """Return True if the position read back is the written one."""
     if back is None:
         return False
     within = HELD_WITHIN if back.armed else WITHIN
@@ -190,7 +191,7 @@ def is_right(back: Back | None, q: Pair) -> bool:
 
 
 class _Track:
-    """Range of a joint's positions, by the drive's own count, rad."""
+    """Range of a joint's positions, rad."""
 
     def __init__(self, q: Pair, now_s: float) -> None:
         self._now = self._low = self._high = self._still_at = np.array(q)
@@ -204,7 +205,7 @@ class _Track:
 
     @property
     def swing(self) -> Swing:
-        """Lowest and highest (phi, theta), relative to its present position."""
+        """Lowest and highest (phi, theta), relative to the present position."""
         low, high = (self._low - self._now).tolist(), (self._high - self._now).tolist()
         return (low[0], low[1]), (high[0], high[1])
 
@@ -215,16 +216,16 @@ def watch(
     progress: Callable[[str], None],
     clock: Callable[[], float] = time.monotonic,
 ) -> dict[str, Swing]:
-    """Return the swings of knees and hips once all have swung and rest, or after `WAIT_S`.
+    """Wait until all knees and hips have swung and rest, or for `WAIT_S`; return their swings.
 
     Args:
-        drives: by module, idle, in their own counts.
-        gear_ratio: N of the differential.
-        progress: receives the missing swings once a second.
+        drives: idle drives by module, in their own counts.
+        gear_ratio: gear ratio N of the differential.
+        progress: receives the missing swings every `PROGRESS_S`.
         clock: s.
 
     Raises:
-        DriveError: a drive has gone silent or is armed.
+        DriveError: a drive is silent or armed.
     """
     tracks: dict[str, _Track] = {}
     begun, told = clock(), clock()
@@ -235,7 +236,8 @@ def watch(
                 continue
             if reading.status in (DriveStatus.LOST, DriveStatus.ARMED):
                 raise DriveError(
-                    f"{module}: its drive is {reading.status.name} while its leg swings"
+                    f"{module}: its drive is {reading.status.name} while its leg swings; see "
+                    "`xrl doctor`"
                 )
             q, now = joint_from_motor(reading.pos_turns, gear_ratio), clock()
             tracks.setdefault(module, _Track(q, now)).move_to(q, now)
@@ -249,7 +251,7 @@ def watch(
 
 
 def _missing(tracks: Mapping[str, _Track], now_s: float) -> list[str]:
-    """Return which joints have not swung yet, or do not rest."""
+    """Return the joints that have not swung yet or do not rest."""
     found = []
     for module, track in tracks.items():
         side = not_swung(track.swing, knee=kind_of(module) == "knee")

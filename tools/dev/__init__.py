@@ -1,1 +1,1 @@
-"""For those who work on this code: reference pages, mutants."""
+"""Developers' tools: reference pages, checks, mutants."""

@@ -1,4 +1,4 @@
-"""Lint, types and tests: the parts of `./deploy/test`, in an environment that exists."""
+"""Lint, types and tests: the parts of `./deploy/test`, in an existing environment."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ CHECKS: Final = (
 PYTEST: Final = ("pytest", "--durations=12", "--durations-min=2")
 CORES: Final = os.cpu_count() or 1
 LIVE: Final = (*PYTEST, "-m", "live and not wide", "tests/system")
-"""None is elsewhere: tests/test_architecture.py."""
+"""Tests on live fleets, all in tests/system (tests/test_architecture.py checks that)."""
 WAITING: Final = (
     *PYTEST, "-m", "system and not live", "--numprocesses", str(2 * CORES), "--dist", "loadfile",
 )  # fmt: skip
-"""They wait, mostly. `main` adds the files in which the mark stands."""
+"""Tests that mostly wait. `main` adds the files that contain the mark `system`."""
 PATIENT: Final = (
     (
         *PYTEST, "-m", "not system and not wide", "--numprocesses", "auto", "--dist", "loadfile",
@@ -39,13 +39,14 @@ PATIENT: Final = (
     ),
     ("python", "-m", "tools.dev.mutants", "--sample"),
 )  # fmt: skip
-"""Neither processes nor real time: they take the time that the others leave on the cores."""
+"""Parts that do not depend on real time; they run while the other parts leave a core idle."""
 
 INTERRUPTED: Final = 128 + signal.SIGINT
 ENDS_BY: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""The first is ignored where a shell started the script in the background."""
+"""Signals that end the run. Each needs a handler: a shell starts background jobs with SIGINT
+ignored."""
 ENDS_IN_S: Final = 30.0
-"""Timeout for a part to end after Ctrl-C: a fleet goes down."""
+"""Timeout for a part to end after Ctrl-C, s; it may have to stop a fleet first."""
 LOOK_EVERY_S: Final = 0.1
 SHOWN_WORDS: Final = 9
 
@@ -54,7 +55,7 @@ class Check:
     """A command, its output and its outcome."""
 
     def __init__(self, command: tuple[str, ...], *, beside: bool = False) -> None:
-        """Start it in a process group of its own, so that it gets one SIGINT from `stop`."""
+        """Start the command in a separate process group, so that only `_stop` sends it SIGINT."""
         words = [word for word in command if not word.startswith("--durations")]
         self.name = shlex.join(words[:SHOWN_WORDS]) + " ..." * (len(words) > SHOWN_WORDS)
         self._is_pytest = command[0] == "pytest"
@@ -70,7 +71,7 @@ class Check:
         )
 
     def follow(self) -> None:
-        """Show what it has said, and says, to its end."""
+        """Print the output of the command until it ends."""
         print(f"== {self.name}", flush=True)
         shown, goes_on = 0, True
         while goes_on:
@@ -86,13 +87,13 @@ class Check:
 
     @property
     def lines(self) -> list[str]:
-        """Its output."""
+        """Lines of the output so far."""
         size = os.fstat(self._said.fileno()).st_size
         return os.pread(self._said.fileno(), size, 0).decode(errors="replace").splitlines()
 
     @property
     def outcome(self) -> str:
-        """Count of tests, or time, for the summary."""
+        """Test counts, or duration, for the summary."""
         if self._is_pytest and self.lines:
             return f"{self.lines[-1].strip('= ')} ({self.name})"
         return f"{self.name}, {self.took_s:.0f} s"
@@ -107,11 +108,14 @@ class Check:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run all parts, or lint, types and the tests that pytest's arguments name; 0, 3 or 130."""
+    """Run all parts; with arguments for pytest, only lint, types and the tests that they select.
+
+    Returns 0, or 3 if a part failed, 130 if interrupted, or 141 if the output pipe closed.
+    """
     for number in ENDS_BY:
         signal.signal(number, signal.default_int_handler)
     begun_s = time.monotonic()
-    # each worker of the waiting tests would import every test: it gets the files with their mark
+    # pass only the files with the mark, because each worker would import all others too
     marked = [
         str(file)
         for file in sorted(Path("tests").rglob("test_*.py"))
@@ -122,7 +126,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         for command in () if argv else PATIENT:
             parts.append(Check(command, beside=True))
-            print(f"== beside the others, shown after them: {parts[-1].name}", flush=True)
+            print(f"== in parallel, shown at the end: {parts[-1].name}", flush=True)
         beside = list(parts)
         for command in (*CHECKS, *alone):
             parts.append(Check(command))
@@ -131,7 +135,7 @@ def main(argv: Sequence[str]) -> int:
             part.follow()
     except KeyboardInterrupt:
         return INTERRUPTED
-    except BrokenPipeError:  # the reader has gone, as with `| head`
+    except BrokenPipeError:  # the reader has ended, as with `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
     finally:
@@ -140,14 +144,14 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _give_way() -> None:
-    """Run while a core is idle: Linux's idle class gives way at once, niceness does not."""
+    """Run only while a core is idle: Linux's idle class yields at once, niceness does not."""
     os.nice(19)
     if hasattr(os, "SCHED_IDLE"):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 
 
 def _stop(running: list[subprocess.Popen[bytes]]) -> None:
-    """End the processes that still run, as Ctrl-C in a terminal of their own would."""
+    """End the processes that still run, as Ctrl-C in their own terminal would."""
     for process in running:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
@@ -160,7 +164,7 @@ def _stop(running: list[subprocess.Popen[bytes]]) -> None:
 
 
 def _summarise(done: list[Check], took_s: float) -> int:
-    """Print what failed, then the last line; return the exit code."""
+    """Print the failures and the summary; return the exit code."""
     failures = [line for part in done for line in part.failures]
     for line in failures:
         print(f"== failed: {line}")

@@ -1,8 +1,8 @@
-"""`./deploy/mutants`: small changes to the code that keeps the robot standing must fail a test.
+"""`./deploy/mutants`: checks that tests detect mutants of the code that keeps the robot standing.
 
-The mutants are mutmut's. `tests/mutants.toml` names modules, by group the tests that hold them,
-and every mutant that may live, with the reason. A group runs in a folder of its own, which holds
-links to the project and mutmut's settings.
+mutmut makes the mutants. `tests/mutants.toml` lists groups of modules with their tests, and every
+mutant that may survive, with the reason. Each group runs in a separate folder, with links to the
+project and with settings for mutmut.
 """
 
 from __future__ import annotations
@@ -30,41 +30,41 @@ from tools.terminal import Console, marked
 ROOT: Final = Path(__file__).resolve().parents[2]
 FILE: Final = ROOT / "tests" / "mutants.toml"
 LEAST_SHARE: Final = 0.95
-"""Mutation score that is asked for: the share of mutants that fail a test."""
+"""Required mutation score: the share of mutants that fail a test."""
 SAMPLE: Final = "*__mutmut_13"
-"""CI runs the thirteenth mutant of every function that has at least thirteen."""
+"""Sample for CI: the thirteenth mutant of every function that has at least thirteen."""
 DEAD: Final = frozenset(("killed", "timeout", "segfault"))
 UNTRIED: Final = "not checked"
 LINKED: Final = ("services", "shared", "tests", "tools", "deploy", "docs", "README.md")
 EXAMPLES: Final = """examples:
   ./deploy/mutants                      all groups; an hour on two cores
-  ./deploy/mutants --group joint        one of them
-  ./deploy/mutants --resume             go on with what was stopped
+  ./deploy/mutants --group joint        one group
+  ./deploy/mutants --resume             continue a stopped run
 """
 
 
 class Group(Section, frozen=True):
-    """Modules, and the tests that are to hold them."""
+    """Modules, and the tests that their mutants must fail."""
 
     name: str
     modules: tuple[str, ...]
     tests: tuple[str, ...]
     without: tuple[str, ...] = ()
-    """Folders in these whose tests are about other modules."""
+    """Folders in `tests` to omit, because they test other modules."""
 
 
 class Mutation(Section, frozen=True, order=True):
     """One mutant."""
 
     function: str
-    """As mutmut names it, such as `services.joint.differential.x_limit_torque`."""
+    """mutmut's name, such as `services.joint.differential.x_limit_torque`."""
     was: str
-    """The lines of code, stripped and joined by a space."""
+    """Changed lines of code before the mutation, stripped and joined by spaces."""
     becomes: str
 
 
 class Reason(Section, frozen=True):
-    """Why some mutants may live."""
+    """Reason why some mutants may survive."""
 
     why: Annotated[str, msgspec.Meta(min_length=20)]
     lives: tuple[Mutation, ...]
@@ -81,13 +81,16 @@ class _GroupResult(NamedTuple):
     """Result of a group."""
 
     counts: Counter[str]
-    """Mutants by mutmut's word for what became of them."""
+    """Number of mutants by mutmut's status."""
     alive: list[tuple[str, Mutation]]
-    """Names and changes of those that live."""
+    """Names and changes of the surviving mutants."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the groups; 0 if few live, and each of them is in the file."""
+    """Run the groups; return 0 if enough mutants fail a test, and the file lists the survivors.
+
+    In a run of all groups, the file must list no other mutants.
+    """
     args = _parser().parse_args(argv)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does
     console = Console(highlight=False)
@@ -97,13 +100,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         names = args.group or ([listed.group[0].name] if args.sample else list(known))
         for name in names:
             if name not in known:
-                raise RunError(f"--group {name}: there are {', '.join(known)}")
+                raise RunError(f"--group {name}: unknown; use one of {', '.join(known)}")
         return _judge([_run(known[name], args, console) for name in names], listed, args, console)
     except XrlError as error:
         console.print(f"mutants: {error}", style="red")
         return error.exit_code
     except KeyboardInterrupt:
-        console.print("stopped; go on with: ./deploy/mutants --resume")
+        console.print("stopped; continue with: ./deploy/mutants --resume")
         return 130
 
 
@@ -116,11 +119,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--group", action="append", help="only this group; may be repeated")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--sample", action="store_true", help="a fixed sample of the first group")
-    which.add_argument("--resume", action="store_true", help="go on with a run that was stopped")
-    parser.add_argument("--children", type=int, default=os.cpu_count(), help="processes")
+    which.add_argument(
+        "--sample", action="store_true", help="a fixed sample; of the first group by default"
+    )
+    which.add_argument("--resume", action="store_true", help="continue a stopped run")
+    parser.add_argument("--children", type=int, default=os.cpu_count(), help="number of processes")
     parser.add_argument(
-        "--out", type=Path, default=ROOT / "out" / "mutants", help="folder (out/mutants)"
+        "--out", type=Path, default=ROOT / "out" / "mutants", help="folder (default: out/mutants)"
     )
     return parser
 
@@ -144,7 +149,6 @@ def _run(group: Group, args: argparse.Namespace, console: Console) -> _GroupResu
 
 
 def _prepare(group: Group, folder: Path) -> None:
-    """Make a group's folder: links to the project, and mutmut's settings."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in LINKED:
         link = folder / name
@@ -152,7 +156,7 @@ def _prepare(group: Group, folder: Path) -> None:
             link.symlink_to(ROOT / name)
     for module in group.modules:
         if not (ROOT / module).is_file():
-            raise RunError(f"{FILE.name}, group {group.name}: there is no {module}")
+            raise RunError(f"{FILE.name}, group {group.name}: {module} does not exist")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     settings = {
         "source_paths": ["services", "shared"],
@@ -164,21 +168,21 @@ def _prepare(group: Group, folder: Path) -> None:
         ],
         "pytest_add_cli_args_test_selection": list(group.tests),
         "timeout_multiplier": 8.0,
-        "timeout_constant": 20.0,  # beside other work
+        "timeout_constant": 20.0,  # other work may run in parallel
     }  # fmt: skip
     text = tomli_w.dumps({"tool": {"pytest": project["tool"]["pytest"], "mutmut": settings}})
     (folder / "pyproject.toml").write_text(text, encoding="utf-8")
 
 
 def _mutmut_run(folder: Path, words: Sequence[str]) -> None:
-    """Run mutmut; its words go into run.log."""
+    """Run mutmut; its output goes into run.log."""
     with (folder / "run.log").open("w", encoding="utf-8") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "mutmut", "run", *words],
             cwd=folder,
             stdout=log,
             stderr=subprocess.STDOUT,
-            start_new_session=True,  # with the processes of its own that it leaves behind
+            start_new_session=True,  # so that its leftover processes end too
         )
         try:
             status = process.wait()
@@ -187,7 +191,7 @@ def _mutmut_run(folder: Path, words: Sequence[str]) -> None:
             raise
     if status != 0:
         last = (folder / "run.log").read_text(encoding="utf-8").strip().splitlines()[-3:]
-        raise RunError(f"mutmut ended with {status}: {' / '.join(last)}")
+        raise RunError(f"mutmut ended with exit code {status}: {' / '.join(last)}")
 
 
 def _mutmut(folder: Path, *words: str) -> str:
@@ -196,14 +200,13 @@ def _mutmut(folder: Path, *words: str) -> str:
 
 
 def _statuses(folder: Path) -> list[tuple[str, str]]:
-    """Return each mutant of a group with mutmut's word for what became of it."""
+    """Return each mutant of a group with mutmut's status."""
     lines = _mutmut(folder, "results", "--all", "true").splitlines()
     pairs = [line.strip().partition(": ") for line in lines if "__mutmut_" in line]
     return [(name, status) for name, _, status in pairs]
 
 
 def _change_of(name: str, shown: str) -> Mutation:
-    """Return what a mutant changes."""
     lines = [line for line in shown.splitlines() if not line.startswith(("---", "+++"))]
     was, becomes = (
         " ".join(line[1:].strip() for line in lines if line.startswith(sign)) for sign in "-+"
@@ -217,25 +220,25 @@ def _judge(
     counts = sum((found.counts for found in groups), Counter[str]())
     total, dead = counts.total(), sum(counts[word] for word in DEAD)
     if not total:
-        raise RunError("no mutant was made")
+        raise RunError("no mutant was tested; see run.log of each group")
     listed = {change for reason in allowed.reason for change in reason.lives}
     alive = [row for found in groups for row in found.alive]
     unlisted = [(name, change) for name, change in alive if change not in listed]
     for name, change in unlisted:
-        console.print(f"lives: {name}", style="red")
+        console.print(f"survives: {name}", style="red")
         console.print(f"  - {change.was}\n  + {change.becomes}", markup=False, soft_wrap=True)
     whole = not (args.sample or args.group)
     stale = listed - {change for _, change in alive} if whole else set()
     for change in sorted(stale):
-        text = f"listed, and does not live: {change.function}: {change.becomes}"
+        text = f"listed, but does not survive: {change.function}: {change.becomes}"
         console.print(text, markup=False, soft_wrap=True)
     console.print(
-        f"{dead} of {total} mutants fail a test ({dead / total:.1%}); {len(alive)} live, "
+        f"{dead} of {total} mutants fail a test ({dead / total:.1%}); {len(alive)} survive, "
         f"{len(alive) - len(unlisted)} of them for a reason in {FILE.relative_to(ROOT)}"
     )
     low = dead < LEAST_SHARE * total
     if low:
-        console.print(f"at least {LEAST_SHARE:.0%} are to fail one", style="red")
+        console.print(f"at least {LEAST_SHARE:.0%} must fail a test", style="red")
     return FAULT_EXIT_CODE if unlisted or stale or low else 0
 
 

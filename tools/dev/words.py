@@ -1,6 +1,6 @@
-"""`python -m tools.dev.words`: finds words that a colleague would not say, with what to write.
+"""`python -m tools.dev.words`: finds phrases that a colleague would not say, with replacements.
 
-Looks through README, docs, and the docstrings, comments and texts of services, shared and tools.
+It searches README, docs, and the Python files of services, shared and tools.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ PATTERNS: Final = (
     (r"\bwhat (it|there) is to\b|\bwhat may not\b", "name the thing"),
     (r"\bkeeps? (silence|still) about\b|\bis silent about\b", "does not report"),
 )
-"""Regular expression, and what to write instead; upper and lower case are the same."""
+"""Regular expression, which ignores case, and what to write instead."""
 PLACES: Final = ("README.md", "CONTRIBUTING.md", "docs/*.md", "services", "shared", "tools")
 _COMPILED: Final = tuple((re.compile(found, re.IGNORECASE), right) for found, right in PATTERNS)
 
 
 def _findings(text: str) -> Iterator[tuple[int, str, str]]:
-    """Yield line number, the words found and what to write, of a text."""
+    """Yield line number, phrase and replacement of each finding in a text."""
     for number, line in enumerate(text.splitlines(), 1):
         for pattern, right in _COMPILED:
             found = pattern.search(line)
@@ -47,14 +47,13 @@ def _findings(text: str) -> Iterator[tuple[int, str, str]]:
 
 
 def _files() -> Iterator[Path]:
-    """Yield every file that is looked through."""
     for place in PLACES:
         path = ROOT / place
         yield from sorted(path.rglob("*.py") if path.is_dir() else ROOT.glob(place))
 
 
 def main() -> int:
-    """Print every finding; a fault if there is one."""
+    """Print every finding; return the exit code, which is a fault if there is any finding."""
     count = 0
     for path in _files():
         if path == Path(__file__).resolve():
@@ -62,7 +61,7 @@ def main() -> int:
         for number, found, right in _findings(path.read_text(encoding="utf-8")):
             count += 1
             print(f"{path.relative_to(ROOT)}:{number}: {found.strip()!r}; write: {right}")
-    print(f"{count} findings" if count else "words: none of the patterns is found")
+    print(f"words: {count} to replace" if count else "words: no findings")
     return FAULT_EXIT_CODE if count else 0
 
 

@@ -44,9 +44,10 @@ def write_bag(
     rate_hz: float,
     done: Callable[[float], None],
 ) -> int:
-    """Write a bag; return its number of messages. Its times are the log's, ns since 1970.
+    """Write a bag with the log's times; return its number of messages.
 
-    `rate_hz` is that of joint states, transforms and wrench; `done` receives the written time, s.
+    `rate_hz` is the rate of joint states, transforms and wrench. `done` receives the time of the
+    run that has been written, s.
     """
     if not TIME_FIRST_NS <= index.began_ns <= index.ended_ns <= TIME_LAST_NS:
         raise RunError(
@@ -81,7 +82,6 @@ def write_bag(
 
 
 def _in_order(log: RunLog) -> Iterator[tuple[int, Topic, str, Message]]:
-    """Yield time, key and message of the gateway's inputs, in order of time."""
     keys = [(t, m) for t in INPUTS for m in (MODULES if t.per_module else ("",))]
     streams = [
         sorted(

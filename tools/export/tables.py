@@ -1,7 +1,7 @@
 """A run as CSV tables: one per key with all of its messages, or one on a time grid.
 
 A column is a field, or an element of a field: `tau_ff[1]`, as in viewers of the log. In a table of
-one key, `time_s` is the sender's stamp on the report's axis (`stamped`).
+one key, `time_s` is the sender's stamp on the report's time axis (`stamped`).
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from tools.logs.run_log import SEE_INFO, NewestAt, RunLog, RunPart, parts_of
 from tools.topic_keys import TopicKey
 
 _CLOCK_NS: Final = NS_PER_S
-"""A stamp that differs more from its reception is on another clock."""
+"""Maximum difference, ns, between a stamp and its reception on one clock."""
 TIME: Final = "time_s"
 GRID_NAME: Final = "run.csv"
 """File name of the table on a grid."""
 HELD_S: Final = 0.5
-"""Cells of a grid stay empty if the newest message is older than this, s: its sender is silent."""
+"""Maximum age of the newest message, s; the cells of a grid stay empty if it is older."""
 
 _HEAD: Final = ("t_ns", "seq")
-"""First fields."""
+"""Fields of the first columns."""
 FOR_REEXECUTION: Final = (topics.JOINT_TRACE, topics.PLANNER_CHECKPOINT, topics.SIM_STATE)
 
 Columns = Mapping[str, Sequence[Any]]
@@ -54,22 +54,20 @@ class _CsvFile:
         self._writer.writerow(columns)
 
     def add(self, columns: Columns) -> None:
-        """Append rows."""
         self._writer.writerows(zip(*columns.values(), strict=True))
 
     def close(self) -> None:
-        """Finish the file."""
         self._file.close()
 
 
 def stamped(
     log: RunLog, topic: Topic, module: str, *, margins: bool = False
 ) -> Iterator[tuple[int, Any]]:
-    """Yield time, monotonic ns of the recorder's clock, and message of a key.
+    """Yield each message of a key with its time, ns on the recorder's monotonic clock.
 
-    The time is the sender's stamp. If that is more than a second off, because the sender is on
-    another host or had no stamp yet, it is the reception, which is up to 40 ms late. `margins` are
-    the messages before and after the part.
+    The time is the sender's stamp. If the stamp is more than a second from the time of reception,
+    because the sender is on another host or had no stamp yet, the time is that of reception, up to
+    40 ms late. With `margins`, messages before and after the part are included.
     """
     received = log.received_ns(topic, module)
     for at_ns, message in zip(received, log.messages(topic, module), strict=True):
@@ -96,7 +94,7 @@ def write_tables(
 ) -> dict[str, int]:
     """Write a file for each key with messages; return the number of rows of each file.
 
-    `done` receives the written time, s.
+    `done` receives the time of the run that has been written, s.
     """
     zero = zero_ns(index)
     open_files: dict[str, _CsvFile] = {}
@@ -133,11 +131,12 @@ def write_grid(
 ) -> int:
     """Write one table on a time grid, with the newest message of each key at each time.
 
-    Topics of events, which have no rate, are left out. Returns the number of rows.
+    Topics of events, which have no rate, are left out. `done` is as for `write_tables`. Returns the
+    number of rows.
     """
     steady = [key for key in keys if key.topic.rate_hz]
     if not steady:
-        raise RunError("--rate: none of these topics has a rate; remove --rate for their events")
+        raise RunError("--rate: none of these topics has a rate; remove --rate to export events")
     readers = {key.topic: columns_of(key.topic.type) for key in steady}
     names = [f"{key.name}.{name}" for key in steady for name in readers[key.topic]]
     zero, step_ns, count, heard = zero_ns(index), NS_PER_S / rate_hz, 0, False
@@ -174,7 +173,7 @@ def _newest_at(log: RunLog, key: TopicKey, grid: Iterable[int]) -> list[Any | No
 
 
 def _add_column(found: dict[str, Reader], name: str, kind: Any, read: Reader) -> None:
-    """Add a field's column, or the columns of its elements; any other value becomes JSON."""
+    """Add a field's column, or the columns of its elements; other values become JSON."""
     elements = get_args(kind)
     if kind in (int, float, bool, str):
         found[name] = read

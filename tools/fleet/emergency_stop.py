@@ -23,7 +23,8 @@ from shared.places import user_name
 from tools.fleet import procfs
 
 REPEAT_S: Final = 0.05
-"""Period of the stop message, s. The bus may drop one, so it repeats until all six have stopped."""
+"""Period of the stop message, s. The bus may drop a message, so it is repeated until all six
+modules have stopped."""
 GIVE_UP_S: Final = 3.0
 UNHEARD_S: Final = 0.5
 """A module is silent if its last state is older than this, s."""
@@ -36,7 +37,8 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
     A service whose shared-memory file is gone, for example with its disk, receives SIGUSR1.
 
     Returns:
-        The modules that received it, and a line for each that could not or cannot confirm it.
+        The modules that received the request, and a line for each that did not or cannot confirm
+        it.
     """
     here, errors = [], []
     processes: dict[str, int] | None = None
@@ -57,7 +59,7 @@ def request_here(run_dir: Path) -> tuple[list[str], list[str]]:
 
 
 def wait_here(run_dir: Path, here: list[str], wanted: Sequence[str] = MODULES) -> list[str]:
-    """Wait until the services on this host have stopped."""
+    """Wait until this host's modules have stopped; return those that have not or are missing."""
     deadline, going = time.monotonic() + GIVE_UP_S, list(here)
     while going and time.monotonic() < deadline:
         # a stopped module stays stopped; it is not read again, since its row might be half written
@@ -90,9 +92,9 @@ class BusStop:
         return [m for m in MODULES if now_s - self._heard_s.get(m, -UNHEARD_S) >= UNHEARD_S]
 
     def stop(self) -> list[str]:
-        """Publish the stop until all six modules have stopped; return each that has not.
+        """Publish the stop until all six modules have stopped; return those that have not in time.
 
-        States from before do not count, because a module may have become silent since.
+        Earlier states do not count, because a module may have become silent since.
         """
         self.listen()
         self._modes.clear()

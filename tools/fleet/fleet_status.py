@@ -1,4 +1,4 @@
-"""Fleet status for `xrl status`: each service by its supervisor and messages, and each module."""
+"""Fleet status for `xrl status`: its services, its modules and the planner."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ from shared.bus.messages import (
     ToolRoster,
     name_of,
 )
+from shared.bus.pubsub import Latest
 from shared.bus.security import TCP
-from shared.bus.session import Latest, Session, peers_of, place_of_tool
+from shared.bus.session import Session, peers_of, place_of_tool
 from shared.bus.sockets import addresses_of
 from shared.bus.tls_probe import own_fault, refusal
 from shared.bus.topics import JOINT_STATE, PLANNER_STATUS, TOOLS, TOPICS
@@ -55,7 +56,7 @@ mode neither does, and the mode says why."""
 
 PLANNER: Final = "planner"
 ROSTER: Final = "tools"
-"""Source of the recorder's roster of tools; no service has this name."""
+"""Name of the monitor for the recorder's roster of tools; no service has this name."""
 SILENT_PROXY: Final = "unknown: the network proxy does not answer"
 
 OPEN: Final = "bus.security.mode is open: anyone who reaches its ports can command this robot"
@@ -65,16 +66,16 @@ _LINKS_S: Final = 1.0
 _WINDOW_S: Final = 0.5
 """Window over which rates are counted, s."""
 _FRESH_S: Final = 1.0
-"""An older message is stale, s: its sender is dead, suspended or cut off."""
+"""Age from which a message is stale, s: its sender is dead, suspended or cut off."""
 _POLL_S: Final = 0.002
 _PROBES_AT_ONCE: Final = 16
 
 
 class ServiceStatus(ServiceInfo, frozen=True):
-    """One service, by its supervisor and by its messages."""
+    """One service, as its supervisor and its messages show it."""
 
     age_s: float | None = None
-    """Age of its newest message; None if none has arrived, or if it publishes none steadily."""
+    """Age of its newest message; None if none has arrived, or if it does not publish steadily."""
     rate_hz: float | None = None
     """Its messages per second, by their sequence numbers; None as for `age_s`."""
     real_time: bool | None = None
@@ -87,7 +88,7 @@ class RefusedCommands(msgspec.Struct, frozen=True):
     cause: str
     """Name of the `Refusal`."""
     session: int
-    """Session of the planner that sends them; 0 if they are not commands."""
+    """Session of the planner that sends them; 0 if unknown, because they are malformed."""
     hz: float
     """Commands per second."""
 
@@ -108,7 +109,7 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     way_out: str = ""
     """Remedy that lets it track again; empty if none is needed."""
     stiffened: bool = False
-    """True if it holds with its full stand gains, because another module may be limp."""
+    """True if its gains rise to the support gains, because another module may be limp."""
     outside: str = ""
     """Name of the refused part of the newest command (`Outside`); empty if it is accepted."""
     session: int = 0
@@ -116,11 +117,12 @@ class ModuleStatus(msgspec.Struct, frozen=True):
     refusals: tuple[RefusedCommands, ...] = ()
     """Commands that it refuses now, by cause and sender."""
     stopped_by: str = ""
-    """Person and host that engaged the active emergency stop, if the service is on this host."""
+    """Person and host that requested the active emergency stop, if the service is on this host."""
     celsius: tuple[float, float] | None = None
     """Estimated temperature of both windings, C; None if not estimated."""
     heat_left_s: float | None = None
-    """Seconds left at this load, 3600 for an hour or more; None if not estimated."""
+    """Seconds at this load until the module is too warm, 3600 for an hour or more; None if not
+    estimated."""
 
 
 class LeadStatus(msgspec.Struct, frozen=True):
@@ -131,14 +133,15 @@ class LeadStatus(msgspec.Struct, frozen=True):
     wait_s: float
     """Remaining back-off until it may lead again after dropouts, s."""
     margin: float
-    """Margin of the gains by the failsafe certificate; 1 is required."""
+    """Margin of the gains by the static certificate: 1 is the required stiffness."""
     why: str = ""
-    """Reason why it does not lead, in words, where the mode does not explain it."""
+    """Reason why it does not lead, in words, if the mode does not explain it."""
     session: int = 0
     carried_n: float = 0.0
     """Weight of payload and person that the robot carries now, N, as in `PlannerStatus`."""
     wearer: str = ""
-    """Wearer's state seen by the planner (`services.planner.watch.park`); empty if they lead."""
+    """Wearer's state as estimated by the planner (`services.planner.watch.park`), in words; empty
+    if the wearer leads."""
 
 
 class FleetStatus(msgspec.Struct, frozen=True):
@@ -157,11 +160,11 @@ class FleetStatus(msgspec.Struct, frozen=True):
     security: str = "local"
     """`bus.security.mode` of the robot file."""
     tools: tuple[str, ...] = ()
-    """Other tools with a link, each by its own NAME.HOST.PID."""
+    """Linked tools besides this process, each as NAME.HOST.PID."""
     trouble: tuple[str, ...] = ()
     """Faults of supervision, logs and disk, one line each."""
     bus_faults: tuple[str, ...] = ()
-    """Under `mtls`: links that TLS refuses, in words."""
+    """Under `mtls`: unusable certificates and links that TLS refuses, in words."""
 
     @property
     def exit_code(self) -> int:
@@ -171,7 +174,7 @@ class FleetStatus(msgspec.Struct, frozen=True):
 
 
 class RateMonitor:
-    """Receives from one service: the newest message, and the first and last of the current window.
+    """Newest message of one service, its age, and its rates in the current window.
 
     The age counts from the arrival, because the stamp is on the sender's clock, which may be that
     of another host.
@@ -263,7 +266,7 @@ class BusFaults:
             yield f"no link over TLS: certificate of {', '.join(names)} {fault}"
 
     def _missing(self, pids: dict[str, int]) -> Iterator[tuple[str, Credentials, str, str]]:
-        """Yield who dials, with which credentials, which peer and where, for each missing link."""
+        """Yield dialling process, its credentials, peer and endpoint of each missing link."""
         alive = self._session.alive()
         for dials, pid in (*pids.items(), (self._session.name, None)):
             if pid is not None and dials not in SERVICES:
@@ -349,7 +352,7 @@ def _service_status(
 
 
 def _is_read_only(folder: Path) -> bool:
-    """Return True if a disk rejects a new file; an unnamed file shows it, mount options may not."""
+    """Return True if a disk rejects a new, unnamed file; mount options may not show this."""
     try:
         os.close(os.open(folder, os.O_TMPFILE | os.O_WRONLY, 0o600))
     except OSError as error:
@@ -362,7 +365,7 @@ def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tupl
     lines = [fault] if fault else []
     lost, why = (0, "") if fault else fleet.lost_lines()  # with a fault this would time out too
     if lost:
-        lines.append(f"{lost} log lines are lost: {why}: {fleet.run.logs}")
+        lines.append(f"log lines are lost: {lost} in {fleet.run.logs}: {why}")
     if not os.access(fleet.run.live, os.W_OK):
         lines.append(
             f"{fleet.run.live}: read-only or missing: a service that ends cannot restart; hang the "
@@ -371,7 +374,7 @@ def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tupl
     if _is_read_only(fleet.run.path):
         lines.append(
             f"{fleet.run.path}: its disk is read-only: logs and records on it are lost. "
-            "Services still restart, but a new fleet does not start: hang the robot, "
+            "Services still restart, but a new fleet cannot start: hang the robot, "
             "run `xrl down`, then repair the disk"
         )
     try:
@@ -384,7 +387,7 @@ def _trouble_of(fleet: SupervisedFleet, services: Iterable[ServiceInfo]) -> tupl
     return (
         *lines,
         *(
-            f"{row.name}: {row.last_exit}, {row.restarts + 1} starts so far; {row.last_line}"
+            f"{row.name}: {row.last_exit}, starts so far: {row.restarts + 1}; {row.last_line}"
             for row in services
             if row.state in ("backoff", "starting") and row.last_exit
         ),
@@ -411,7 +414,7 @@ def impairments(fleet: SupervisedFleet) -> tuple[str, ...]:
 def module_status(
     state: Message | None, refusals: tuple[RefusedCommands, ...] = (), stopped_by: str = ""
 ) -> ModuleStatus:
-    """Return a module's mode and tier from the newest state of its joint service."""
+    """Return a module's status from the newest state of its joint service."""
     if not isinstance(state, JointState):
         return ModuleStatus()
     mode = state.mode

@@ -2,7 +2,7 @@
 
 The services write it only to memory in the live directory, because a store to a mapped file on a
 failing disk can end the process (SIGBUS). The supervisor copies it to the run directory every 5 s,
-and the next start reads it there. A disk that rejects writes costs only the copy.
+and the next start reads it there. If the disk rejects writes, only the copy is missing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def save(run_dir: Path) -> bool:
 
 
 def restore(run_dir: Path) -> None:
-    """Copy from the run directory what the live directory lacks, as after a power cut."""
+    """Copy files from the run directory that the live directory lacks, as after a power cut."""
     _copy(run_dir, live_dir(run_dir), replace=False)
 
 

@@ -24,7 +24,7 @@ A fleet in real time leaves about 0.25."""
 
 
 class CoresFullError(FleetError):
-    """The cores are full while the fleet stands, or the fleet does not get to stand."""
+    """The cores are full while the robot stands or stands up."""
 
 
 class PaceFlags(Flags):
@@ -35,9 +35,9 @@ class PaceFlags(Flags):
         Range(PACE_MIN, 1.0, ""),
         Arg(
             metavar="X",
-            help="clock rate of a simulated fleet: 0.5 is slow motion at half speed, as on a "
-            f"machine twice as fast (default: ${PACE_VARIABLE}, else 1; `demo` and `study crash` "
-            f"multiply it by {SLOWER:g} if the cores are full before the scenario starts)",
+            help="clock rate of a simulated fleet: 0.5 is half speed "
+            f"(default: ${PACE_VARIABLE}, else 1; if the cores are full before the scenario "
+            f"starts, `demo` and `study crash` restart at {SLOWER:g} times this default)",
         ),
     ] = None
 
@@ -56,7 +56,9 @@ def check_pace(pace: float, *, simulated: bool) -> None:
     if not PACE_MIN <= pace <= 1.0:
         raise FleetError(f"--pace {pace:g}: must be between {PACE_MIN:g} and 1")
     if pace != 1.0 and not simulated:
-        raise FleetError(f"--pace {pace:g}: only a simulated fleet has slow motion; remove --pace")
+        raise FleetError(
+            f"--pace {pace:g}: only a simulated fleet can run in slow motion; remove --pace"
+        )
 
 
 def run_at_fitting_pace(run: Callable[[float], T], tell: Callable[[str], None]) -> T:

@@ -71,12 +71,12 @@ class Process(Section, frozen=True):
     stop_s: Annotated[int, Range(1, 60, "s")]
     """Time from the stop signal to SIGKILL."""
     settle_s: Annotated[int, Range(1, 60, "s")]
-    """A start that ends sooner has failed, and the next start is delayed."""
+    """A process that ends sooner counts as a failed start, and its next start is delayed."""
     why: str
     only: Literal["", "simulation", "injected", "imu", "ros2", "named"] = ""
-    """`simulation`: not started where the drives are real; `injected`: only where the network is
-    impaired; `imu`: only on a robot with an IMU; `ros2`: only where ROS 2 sees the robot;
-    `named`: only if requested by name."""
+    """Condition of its start. `simulation`: emulated drives; `injected`: the network can be
+    impaired; `imu`: an IMU is fitted; `ros2`: ROS 2 is requested; `named`: this service is
+    requested by name."""
     extra: str = ""
     """Extra of pyproject.toml with the packages that it needs."""
     topic: str = ""
@@ -105,7 +105,7 @@ class FleetOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Options of a fleet's start, besides its robot file and its run directory."""
 
     services: Collection[str] | None = None
-    """Services to start, whatever their rows say; None for all that the table starts by default."""
+    """Services to start, even without `autostart`; None for all that start by default."""
     not_started: Collection[str] = ()
     """Services that wait for `SupervisedFleet.start_service`."""
     overrides: Mapping[str, Sequence[str]] = {}
@@ -123,12 +123,12 @@ class FleetOptions(msgspec.Struct, frozen=True, kw_only=True):
     leashed: bool = False
     """Stop the fleet if this process or the supervisor dies."""
     disarmed: bool = False
-    """Start without a person's request. It arms no drive, takes over holding drives, and keeps an
-    emergency stop and the logs of ended services. If a service fails to start, no other is ended,
-    since that would idle their drives; the supervisor keeps trying."""
+    """Start without a person's request: arm no drive, take over holding drives, and keep an
+    emergency stop and the logs of ended services. If a service fails to start, the others are not
+    ended, since that would idle their drives; the supervisor keeps trying."""
     table_path: Path = TABLE
     timeout_s: float = 30.0
-    """Time without progress after which the start fails (`supervise.START_MAX_S`), s."""
+    """Timeout of a start that makes no progress, s; with progress it is `supervise.START_MAX_S`."""
 
 
 class FleetPlan(NamedTuple):
@@ -139,15 +139,15 @@ class FleetPlan(NamedTuple):
     options: FleetOptions
     processes: tuple[Process, ...]
     commands: dict[str, list[str]]
-    """Arguments of each service, placeholders filled in."""
+    """Command line of each service, with placeholders filled in."""
     listeners: tuple[ListenPoint, ...]
     environment: dict[str, str]
     emulated_usb: bool = False
-    """The services search USB for their drives, and find emulated ones."""
+    """True if the services find emulated drives on USB."""
 
 
 def make_plan(config_path: Path, run_dir: Path, options: FleetOptions) -> FleetPlan:
-    """Return the processes to start; refuse what cannot be started here."""
+    """Return the processes to start; refuse a fleet that cannot start here."""
     path = Path(os.path.abspath(config_path))  # noqa: PTH100 - symlinks stay as they were given
     config = load(path)
     table = load_table(options.table_path)
@@ -188,7 +188,10 @@ def _selected(
     services, named = options.services or (), options.services is not None
     check_known(services, [row.name for row in table.process])
     if "imu" in services and not config.imu.fitted:
-        raise FleetError("imu: this robot has no IMU (`fitted` of [imu] in the robot file)")
+        raise FleetError(
+            "imu: this robot has no IMU (`fitted` of [imu] in the robot file); leave out imu, or "
+            "correct the key"
+        )
     if "ros2_gateway" in services and not options.ros2:
         raise FleetError("ros2_gateway: it starts only with --ros2; add --ros2")
     wanted = {
@@ -213,20 +216,23 @@ def load_table(path: Path = TABLE) -> _ProcessTable:
     rows: list[Process] = []
     for index, row in enumerate(table.process):
         if not row.command:
-            raise ConfigError(str(path), f"process[{index}].command", "empty", "a program to run")
+            raise ConfigError(
+                str(path), f"process[{index}].command", "empty", "must name a program"
+            )
         for key, value, known in (
             ("topic", row.topic, [topic.name for topic in TOPICS]),
             ("extra", row.extra, list(EXTRAS)),
         ):
             if value and value not in known:
-                right = f"one of {', '.join(known)}"
+                right = f"must be one of {', '.join(known)}"
                 raise ConfigError(str(path), f"process[{index}].{key}", f"{value!r}", right)
         _check_placeholders(path, index, row)
         rows += [_of_module(row, module) for module in MODULES] if row.name == MODULE else [row]
     names = [row.name for row in rows]
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(str(path), "process", f"{name!r} is in it twice", "each service once")
+            right = "must be listed once"
+            raise ConfigError(str(path), "process", f"{name!r} is in it twice", right)
     return msgspec.structs.replace(table, process=tuple(rows))
 
 
@@ -238,7 +244,7 @@ def _check_placeholders(path: Path, index: int, row: Process) -> None:
         stray = stray_braces(text, placeholders)
         if stray:
             found = f"{text!r}: {stray} is not a placeholder here"
-            right = f"one of {', '.join(placeholders)}"
+            right = f"must be one of {', '.join(placeholders)}"
             raise ConfigError(str(path), f"process[{index}].{key}", found, right)
 
 
@@ -250,8 +256,8 @@ def _of_module(row: Process, module: str) -> Process:
 def is_simulated(config: RobotConfig) -> bool:
     """Return True if any drive of this robot file is emulated.
 
-    The CAN buses in use decide, also for drives on USB. On a real robot all of them are real, or
-    the fleet starts with `simulation=False` (`xrl up --no-sim`). Then services search the real USB.
+    The CAN buses in use decide, also for drives on USB. On a real robot all buses are real, or the
+    fleet starts with `simulation=False` (`xrl up --no-sim`); then services search the real USB.
     """
     return any(config.can[name].interface == SIMULATED_CAN for name in config.buses)
 
@@ -259,7 +265,8 @@ def is_simulated(config: RobotConfig) -> bool:
 def refuse_half_emulated(robot: RobotConfig) -> None:
     """Refuse a robot file that mixes emulated and real buses.
 
-    A single forgotten emulated bus would make its USB emulated, and every emulated drive is valid.
+    With a single forgotten emulated bus, services would use emulated USB drives instead of the real
+    ones, and no check would fail.
     """
     emulated = {name: robot.can[name].interface == SIMULATED_CAN for name in sorted(robot.buses)}
     if len(set(emulated.values())) > 1:
@@ -269,8 +276,8 @@ def refuse_half_emulated(robot: RobotConfig) -> None:
         )
         raise FleetError(
             f"robot file: {some} {'are' if ',' in some else 'is'} emulated "
-            f'(interface = "{SIMULATED_CAN}"), {real} not: which drives are meant? Make '
-            "all of them real or all emulated; `xrl up --no-sim` starts no simulator"
+            f'(interface = "{SIMULATED_CAN}"), {real} {"are" if "," in real else "is"} not; make '
+            "all of them real or all emulated, or start without the simulator: `xrl up --no-sim`"
         )
 
 
@@ -314,8 +321,8 @@ def _check_lengths(run_dir: Path, listeners: Iterable[ListenPoint]) -> None:
     excess = max(len(os.fsencode(path)) for path in paths) - SOCKET_PATH_MAX
     if excess > 0:
         raise FleetError(
-            f"{run_dir}: run directory is {excess} bytes too long for the paths of its sockets; "
-            "choose a shorter one with --run-dir"
+            f"{run_dir}: the paths of its sockets would be {excess} B too long; "
+            "choose a shorter run directory with --run-dir"
         )
 
 
@@ -327,10 +334,9 @@ def check_free(listeners: Iterable[ListenPoint]) -> None:
         else:
             fault = _tcp_fault(endpoint)
         if fault:
-            raise FleetError(
-                f"{service}: {endpoint}: {fault}; stop the process that uses it, or change {key} "
-                "in the robot file"
-            )
+            stop = "stop the process that uses it, or " if fault.endswith("in use") else ""
+            change = f"change {key} in the robot file" if "." in key else "choose another --run-dir"
+            raise FleetError(f"{service}: {endpoint}: {fault}; {stop}{change}")
 
 
 def is_elsewhere(endpoint: str) -> bool:

@@ -81,7 +81,7 @@ def connected(pid: int) -> set[tuple[str, int]]:
 
 
 def cpu_s_of(pids: Iterable[int]) -> dict[int, float]:
-    """Return the CPU time that processes have used, without those that have ended."""
+    """Return the CPU time of each process, s; processes that have ended are left out."""
     fields = {pid: _stat(pid) for pid in pids}
     return {pid: (int(f[11]) + int(f[12])) / _TICKS_PER_S for pid, f in fields.items() if f}
 

@@ -27,7 +27,7 @@ _decode = msgspec.json.Decoder(Reply).decode
 
 
 class ProxyClient:
-    """One connection per request and reply."""
+    """Client that opens a new connection for each request."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir, self._path = run_dir, live_dir(run_dir) / SOCKET

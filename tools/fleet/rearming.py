@@ -1,8 +1,8 @@
-"""End of an emergency stop: all six modules are armed again together, or none of them.
+"""End of an emergency stop: all six modules are re-armed together, or none of them.
 
 A module that is re-armed alone holds while the other five sink, so the services of all stopped
 modules restart at the same moment. Each drive holds with its own loop until its new service takes
-it over, which needs a planner.
+it over; the take-over needs a planner.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def rearm(fleet: SupervisedFleet) -> float:
     """End the emergency stop; return the time until all six modules hold or track, s.
 
     Raises:
-        FleetError: it is not safe, and nothing was changed; or a module does not hold in time.
+        FleetError: ending the stop is not safe, so nothing was changed; or a module does not hold
+            or track in time.
     """
     with open_session(fleet.manifest.robot(), "rearm", fleet.run.path) as session:
         ear = _Ear(session)
@@ -83,15 +84,15 @@ def hindrance(
             mode, drive = name_of(Mode, state.mode), name_of(DriveStatus, state.drive)
             return f"{module} is in {mode}, its drive is {drive}; {_LIMP}"
     if elsewhere := [module for module in stopped if module not in here]:
-        return f"no service of {', '.join(elsewhere)} on this host; run `xrl hosts down`, then `up`"
+        return f"no service of {', '.join(elsewhere)} on this host; run `xrl hosts down` and `up`"
     if moved:
-        return f"{', '.join(moved)} still moving; wait until the robot has stopped moving"
+        return f"{', '.join(moved)} still moving; wait until the robot is at rest"
     if pull_n > PULL_MAX_N:
         return (
             f"{pull_n:.0f} N on the harness would move the robot at once; reduce it below "
             f"{PULL_MAX_N:g} N (take hands and load off; move a simulated hand with `xrl lead`)"
         )
-    return "" if planner else "no planner is running, and only a planner lets drives be taken over"
+    return "" if planner else "no planner is running, but taking over a drive needs one"
 
 
 class _Ear:
@@ -132,7 +133,7 @@ class _Ear:
         return {module: state for module, state in self._newest.items() if self._hears(module)}
 
     def listen_for_all(self) -> None:
-        """Wait for the first message of each, at most `HEARD_S`."""
+        """Wait for the first message of each module and of a planner, at most `HEARD_S`."""
         deadline_s = time.monotonic() + HEARD_S
         while time.monotonic() < deadline_s and not (
             self.hears_planner and len(self.states) == len(MODULES)
@@ -156,7 +157,7 @@ class _Ear:
         """Wait until all six hold or track, by their new states; return the time, s.
 
         Raises:
-            FleetError: a module does not in time.
+            FleetError: a module does not do so in time.
         """
         begin_s = time.monotonic()
         self._newest.clear()

@@ -29,9 +29,10 @@ from tools.fleet import kept_state
 from tools.fleet.process_table import SUPERVISOR_SOCKET, UNIX, FleetPlan, is_listening
 
 SUPERVISOR_PID: Final = "supervisord.pid"
-"""Written when the fleet starts."""
+"""File with the supervisor's process id, written when the fleet starts."""
 MARKER: Final = ".xrl-run"
-"""Present in every run directory; without it nothing is removed, and nothing attaches."""
+"""File in every run directory. Without it, no tool removes files there, and a fleet starts there
+only if there are no foreign files."""
 
 ENDING_S: Final = 0.5
 """Timeout for the lock of a fleet whose processes were killed and are no longer found, s."""
@@ -45,7 +46,8 @@ _LOGGED: Final = (*SERVICES, "network_proxy", "ros2_gateway", "supervisord", "vi
 """Processes that have a log in a run directory."""
 
 FILES_MIN: Final = 128
-"""Minimum limit of open files for the supervisor: three for each of about twelve services."""
+"""Minimum limit of open files for the supervisor, which needs three for each of about twelve
+services."""
 SPACE_MIN_MIB: Final = 4
 """Free space that a start needs in the run directory, for logs."""
 SPACE_LOW_MIB: Final = 64
@@ -68,7 +70,7 @@ class Manifest(msgspec.Struct, frozen=True):
     """Longest time that a service may take to stop, s."""
 
     def robot(self) -> RobotConfig:
-        """Return the robot from its file."""
+        """Return the robot that the robot file describes."""
         return load(Path(self.config))
 
 
@@ -99,10 +101,11 @@ class RunDir:
         return self.marker.exists()
 
     def claim(self, *, alone: bool = True) -> int:
-        """Create the directory, or use an empty or a fleet's directory; mark and lock it.
+        """Create the directory, or use an empty one or a fleet's; mark it, and return its lock.
 
-        The supervisor inherits the descriptor, so the lock lives as long as the supervisor. A
-        killed process may still hold it for a moment after it has disappeared: `ENDING_S`.
+        The lock is a descriptor. The supervisor inherits it, so the lock lives as long as the
+        supervisor. A killed process may hold the lock for a moment after it has disappeared:
+        `ENDING_S`.
         """
         give_up_s = time.monotonic() + ENDING_S
         while True:
@@ -153,7 +156,7 @@ class RunDir:
     def _foreign(self) -> str | None:
         """Return the name of a file here that is not a fleet's, or None."""
         if self.supervisor_log.exists():
-            return None  # a fleet of a version without a mark
+            return None  # a fleet of an older version, without a mark
         for entry in sorted(self.path.iterdir()):
             by_hand = any(entry.match(pattern) for pattern in _BY_HAND)
             if not by_hand and not stat.S_ISSOCK(entry.lstat().st_mode):
@@ -169,7 +172,7 @@ class RunDir:
     def prepare(self, plan: FleetPlan, pace: float = 1.0) -> None:
         """Remove old logs and dead sockets; write the files of the supervisor and the services.
 
-        A nearly full disk does not stop a disarmed start, because no person is there to react.
+        A nearly full disk does not prevent a disarmed start, because no person is there to react.
         """
         try:
             self._prepare(plan, pace)
@@ -218,7 +221,7 @@ class RunDir:
                     guard.write(LastState.HELD)
 
     def _remove_shared_memory(self, *, keep_stops: bool) -> None:
-        """Remove the shared memory of an earlier fleet, but rearm guards only if a person asks."""
+        """Remove an earlier fleet's shared memory; the rearm guards too, unless `keep_stops`."""
         neighbours.path_of(self.path).unlink(missing_ok=True)
         for module in () if keep_stops else MODULES:
             rearm_guard.path_of(self.path, module).unlink(missing_ok=True)
@@ -263,7 +266,7 @@ class RunDir:
         if self.live != self.path:
             for heat in () if keep_heat else self.live.glob(kept_state.HEAT):
                 heat.unlink()
-            with contextlib.suppress(OSError):  # missing, or it keeps a stop or other files
+            with contextlib.suppress(OSError):  # missing, or it contains a stop or other files
                 self.live.rmdir()
 
     def _remove_logs(self) -> None:

@@ -1,4 +1,4 @@
-"""Stalls: times in which the machine ran nothing. The judgement excludes their consequences.
+"""Stalls: times in which the machine ran nothing. The verdict excludes their consequences.
 
 A module that gets no command in time holds, as it should. One timer thread measures stalls during
 a live run. The status line, picture and verdict show them, the latter two from the record's events.
@@ -23,16 +23,18 @@ from shared.clock import NS_PER_MS, NS_PER_S, pace
 MACHINE: Final = "the machine"
 PERIOD_NS: Final = 4 * NS_PER_MS
 GAP_NS: Final = 20 * NS_PER_MS
-"""Minimum delay beyond the period that counts; with network delay, an age can reach 50 ms."""
+"""Minimum delay of a stall, beyond the period. Together with the network's delay it can make
+commands 50 ms old."""
 PRIORITY: Final = 30
-"""Above every service (`shared.scheduling`), and within the limit in docs/bring-up.md."""
+"""Real-time priority above every service's, and within the limit in docs/bring-up.md."""
 LASTED_MAX_MS: Final = 1e9
 DROP_OUT_NS: Final = 150 * NS_PER_MS
-"""Time after a stall within which a module loses TRACK because its commands are too old."""
+"""Time after a stall within which a dropout because of old commands is attributed to the stall."""
 EXCUSE_MIN_MS: Final = 30.0
-"""A shorter stall makes no command 50 ms old: most commands are about 10 ms old when used."""
+"""A shorter stall alone makes no command 50 ms old: most commands are about 10 ms old when used."""
 APART_NS: Final = 3 * NS_PER_S
-"""Time after a stall in which modules track again and the robot catches up with the hand."""
+"""Time after a stall that led and held figures exclude: modules return to TRACK, and the robot
+catches up with the hand."""
 STALL_SHOWN_NS: Final = 2 * NS_PER_S
 """Time for which a display shows a stall."""
 
@@ -63,7 +65,7 @@ class Stall(NamedTuple):
 
 
 def stalls_of(events: Iterable[RunEvent]) -> list[Stall]:
-    """Return the stalls among a run's events, without those in another form."""
+    """Return the stalls among a run's events; malformed events are ignored."""
     found = []
     for event in events:
         with suppress(ValueError):  # the event was written by hand
@@ -75,7 +77,7 @@ def stalls_of(events: Iterable[RunEvent]) -> list[Stall]:
 
 
 class Disturbance(NamedTuple):
-    """A stall, the end of the time that is judged separately, and the modules that it held."""
+    """A stall, the end of the time that led and held figures exclude, and the modules in HOLD."""
 
     stall: Stall
     end_ns: int
@@ -85,9 +87,10 @@ class Disturbance(NamedTuple):
 def disturbances(
     events: Sequence[RunEvent], changes: Sequence[JointEvent], end_ns: int
 ) -> list[Disturbance]:
-    """Return the effect of each stall until a time; `changes` are those of all modules.
+    """Return the effect of each stall that begins by `end_ns`.
 
-    A HOLD after a kill or a fault is not attributed to a stall: the kill may have caused it.
+    `changes` are the mode changes of all modules. A HOLD after a kill or a fault is not attributed
+    to a stall: the kill or fault may have caused it.
     """
     own, by_it = (RunEventKind.KILLED, RunEventKind.FAULTED), (Cause.COMMAND_STALE, Cause.HOLD_ALL)
     limit_ns = min([row.t_ns for row in events if row.kind in own] + [end_ns])
@@ -110,7 +113,7 @@ def goes_to_hold(row: JointEvent) -> bool:
 
 
 def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return for each time whether it is judged separately."""
+    """Return for each time whether led and held figures exclude it."""
     mask = np.zeros(len(times_ns), dtype=bool)
     for row in rows:
         mask |= (times_ns >= row.stall.begin_ns) & (times_ns <= row.end_ns)
@@ -118,13 +121,13 @@ def inside(rows: Iterable[Disturbance], times_ns: NDArray[np.int64]) -> NDArray[
 
 
 class StallWatch:
-    """A timer thread beside a fleet, with real-time priority where that is allowed."""
+    """A timer thread beside a fleet, with real-time priority if permitted."""
 
     def __init__(self) -> None:
         self.longest = Stall(0, 0)
         """Longest recent stall; (0, 0) before the first."""
         self.held = 0
-        """Largest number of modules in HOLD at once since then."""
+        """Largest number of modules in HOLD at once since that stall."""
         self._gaps: deque[tuple[int, int]] = deque()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="stalls", daemon=True)

@@ -41,10 +41,10 @@ def _describe_lead(lead: LeadStatus | None) -> str:
 REMEDIES: Final = {
     Refusal.TOO_OLD.name: "a slow link or a slow planner",
     Refusal.FOREIGN_SESSION.name: "a second planner, or one that the module has left: end one",
-    Refusal.NOT_NEWER.name: "a network that repeats, or a command forged in the planner's name",
+    Refusal.NOT_NEWER.name: "repeated packets, or a command forged in the planner's name",
     Refusal.OUT_OF_ENVELOPE.name: "a faulty planner, or a forged command: run xrl kill planner",
     Refusal.OUT_OF_LIMITS.name: "a faulty planner, or a forged command: run xrl kill planner",
-    Refusal.TOO_FAR_AHEAD.name: "a number that no planner reaches: find out who sends it",
+    Refusal.TOO_FAR_AHEAD.name: "a sequence number that no planner reaches: find the sender",
     Refusal.FROM_THE_FUTURE.name: "mixed clocks of several hosts, or a forged command",
     Refusal.MALFORMED.name: "no planner sends null, NaN or broken JSON: find the sender",
 }

@@ -37,7 +37,7 @@ START_MAX_S = 600.0
 """Timeout of a start that makes progress, s."""
 _KILLED_S = 5.0  # timeout for the kernel to clear away killed processes
 _LOOPS = 3
-"""Ends within a minute from which a service is in a crash loop."""
+"""Number of ends within a minute that make a crash loop."""
 _FAILED = ("backoff", "exited", "fatal")
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _BY_DEFAULT = FleetOptions()
@@ -47,7 +47,7 @@ class SupervisedFleet:
     """The services of one run directory."""
 
     def __init__(self, run_dir: Path) -> None:
-        """Name a fleet that may be up; `start` and `attach` check it."""
+        """Refer to a fleet that may be up; `start` and `attach` check it."""
         self.run = RunDir(run_dir)
         self._supervisor = Supervisor(self.run)
         self._process: subprocess.Popen[bytes] | None = None
@@ -56,7 +56,8 @@ class SupervisedFleet:
     def start(cls, config_path: Path, run_dir: Path, options: FleetOptions = _BY_DEFAULT) -> Self:
         """Start the services of a robot file and wait until every service is up.
 
-        If it is interrupted or fails, it stops the started services; the logs of a failure stay.
+        If the start is interrupted or fails, it ends the started services. After a failure their
+        logs remain. With `disarmed`, a service that does not start ends no other.
 
         Raises:
             ConfigError: the robot file or the table cannot be used.
@@ -74,7 +75,9 @@ class SupervisedFleet:
         check_pace(clock_pace, simulated=simulated)
         files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
         if 0 <= files < FILES_MIN:
-            raise FleetError(f"limit of {files} open files, need {FILES_MIN}: raise ulimit -n")
+            raise FleetError(
+                f"limit of open files: {files}, but {FILES_MIN} are needed; raise it (`ulimit -Hn`)"
+            )
         lock = started.run.claim()
         try:
             started._end_unsupervised(take_over=options.disarmed and not simulated)
@@ -93,8 +96,8 @@ class SupervisedFleet:
         if run.read_manifest() is None:
             if running:
                 raise FleetError(
-                    f"{run.path}: {len(running)} processes of a fleet run, but its files are gone; "
-                    "`xrl estop` stops the robot, `xrl down` ends the processes"
+                    f"{run.path}: a fleet runs here (processes: {len(running)}), but its files are "
+                    "gone; `xrl estop` stops the robot, `xrl down` ends the processes"
                 )
             raise _not_up(run)
         if fault := attached.supervision_fault():
@@ -157,7 +160,7 @@ class SupervisedFleet:
         """Let the next process of a joint service arm its drive, whatever state the last one left.
 
         Returns:
-            Why that failed, which is also logged; empty if the state is cleared.
+            Reason for a failure, which is also logged; empty if the state is cleared.
         """
         try:
             rearm_guard.clear(self.run.path, service)
@@ -186,13 +189,14 @@ class SupervisedFleet:
         """Restart joint services at the same moment; their next processes arm their drives.
 
         Raises:
-            FleetError: one has no process, or nothing would restart it; then nothing is changed.
+            FleetError: a service has no process, or there is no supervisor to restart it. Nothing
+                is changed then.
         """
         if fault := self.supervision_fault():
             raise FleetError(f"nothing was restarted: {fault}")
         pids = self.pids()
         if missing := [module for module in modules if module not in pids]:
-            raise FleetError(f"nothing was restarted: {', '.join(missing)} have no process")
+            raise FleetError(f"nothing was restarted: no process for {', '.join(missing)}")
         rearm_guard.clear(self.run.path, *modules)
         procfs.signal_all([pids[module] for module in modules], signal.SIGKILL)
 
@@ -201,7 +205,7 @@ class SupervisedFleet:
 
         If the service is running, return its process id and change nothing.
 
-        A person has requested it, so a drive that lost torque is armed again
+        Because a person requests it, a drive that lost torque is armed again
         (`services.joint.rearm_guard`). A suspended service is continued.
         """
         process_table.check_known([service], self.manifest.services)
@@ -223,7 +227,7 @@ class SupervisedFleet:
     def stop(self, *, keep_logs: bool = False, keep_stops: bool = False) -> None:
         """Stop every service and the supervisor, and remove their files.
 
-        Each service, even a suspended one, first gets its own signal, then SIGKILL after its
+        Each service, even a suspended one, first gets its stop signal, then SIGKILL after its
         timeout. Without a fleet this does nothing. Only foreign files and requested logs remain
         in the run directory; with `keep_stops` an emergency stop remains too.
         """
@@ -254,7 +258,7 @@ class SupervisedFleet:
             except FleetError as error:
                 if not (disarmed and self._is_supervised):
                     raise
-                log.get("xrl").warning("%s; the supervisor keeps trying", error)
+                log.get("xrl").warning("the supervisor keeps trying: %s", error)
         except BaseException as error:
             with _uninterrupted():
                 self._end()
@@ -273,8 +277,8 @@ class SupervisedFleet:
             return
         if not take_over:
             raise FleetError(
-                f"{self.run.path}: {len(left)} processes of a fleet without a supervisor run here; "
-                "`xrl down` ends them, which drops the robot"
+                f"{self.run.path}: a fleet without a supervisor runs here (processes: {len(left)}"
+                "); `xrl down` lowers the robot and ends the processes"
             )
         procfs.signal_all(left, signal.SIGCONT)
         procfs.signal_all(left, signal.SIGTERM)  # leaves the drives holding
@@ -309,7 +313,9 @@ class SupervisedFleet:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(_POLL_S)  # otherwise it stays a zombie of this process
         if left:
-            raise FleetError(f"processes {sorted(left)} did not end, even after SIGKILL")
+            raise FleetError(
+                f"still running after SIGKILL: process {', '.join(map(str, sorted(left)))}"
+            )
 
     def _launch(self, environment: Mapping[str, str], lock: int, *, leashed: bool) -> None:
         leash = ["--parent", str(os.getpid())] if leashed else []
@@ -329,7 +335,7 @@ class SupervisedFleet:
             )
 
     def _wait_until_up(self, plan: FleetPlan) -> None:
-        endpoints = {  # for a service with two endpoints the first: its socket
+        endpoints = {  # the first of a service's endpoints, its socket
             item.service: item.endpoint
             for item in reversed(plan.listeners)
             if item.key.startswith("bus.")

@@ -17,14 +17,14 @@ from tools.fleet.run_dir import RunDir
 
 _TIMEOUT_S = 3.0
 UNSUPERVISED: Final = (
-    "running services continue and obey `xrl estop`, but nothing restarts one that ends: "
+    "running services continue, and `xrl estop` works, but nothing restarts one that ends: "
     "hang the robot, then run `xrl down`"
 )
 """Consequence of a dead supervisor, and the remedy."""
 
 
 class ServiceInfo(msgspec.Struct, frozen=True):
-    """One service as its supervisor and the kernel see it."""
+    """One service, as reported by its supervisor and the kernel."""
 
     name: str
     pid: int | None
@@ -36,7 +36,7 @@ class ServiceInfo(msgspec.Struct, frozen=True):
     uptime_s: float
     """Since its start; 0 while it has no process."""
     restarts: int = 0
-    """Starts since the first one, wanted or not."""
+    """Number of starts after the first one."""
     last_exit: str = ""
     """Its last end, for example "terminated by SIGKILL", or an empty string."""
     last_line: str = ""

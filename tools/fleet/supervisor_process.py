@@ -3,7 +3,7 @@
 Supervision must survive a full, read-only or vanished disk. A log line that cannot be written is
 counted and dropped, and the next line tries the file again. The services outlive their supervisor,
 because they keep the robot standing, and they still receive an emergency stop. With `--parent
-PID`, the fleet belongs to a tool and has no robot: it ends when that process or its supervisor
+PID`, the fleet belongs to a tool and has no real robot: it ends when that process or its supervisor
 dies.
 """
 
@@ -46,7 +46,7 @@ class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no type
     lost = 0
     """Lines that could not be written, in all logs of this process."""
     why = ""
-    """Why the newest of them was lost."""
+    """Reason why the newest of them was lost."""
     newest: ClassVar[dict[str, str]] = {}
     """Newest line of each file, even if it could not be written."""
 
@@ -69,7 +69,7 @@ class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no type
         try:
             self._open()
             if self._missing:
-                self._write(f"({self._missing} lines are missing: {_LogFile.why})\n".encode())
+                self._write(f"(lines missing here: {self._missing}: {_LogFile.why})\n".encode())
                 self._missing = 0
             self._write(text)
             if 0 < self._max_bytes <= Path(self.baseFilename).stat().st_size:
@@ -114,7 +114,7 @@ class _LogFile(loggers.Handler):  # type: ignore[misc]  # supervisor has no type
 
 
 class Service(process.Subprocess):  # type: ignore[misc]  # supervisor has no types
-    """One service; it counts its starts and remembers how it ended, without a log."""
+    """One service, which counts its starts and records how it ended, independently of its log."""
 
     starts = 0
     last_exit = ""
@@ -200,8 +200,12 @@ def main() -> None:
     # The tool that starts this process blocks signals during the start, and the mask is inherited.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     parser = FlagParser(description=__doc__)
-    parser.add_argument("--parent", type=int, help="stop the fleet when this process dies")
-    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="for supervisord, after --")
+    parser.add_argument(
+        "--parent", type=int, help="process id; stop the fleet when that process dies"
+    )
+    parser.add_argument(
+        "arguments", nargs=argparse.REMAINDER, help="arguments of supervisord, after --"
+    )
     args = parser.parse_args()
     if args.parent is not None:
         die_with_parent(args.parent, signal.SIGTERM)

@@ -1,1 +1,1 @@
-"""A robot on several hosts: what runs where, and each host's files (docs/hosts.md)."""
+"""A robot on several hosts: each host's services and files (docs/hosts.md)."""

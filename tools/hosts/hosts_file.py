@@ -1,4 +1,4 @@
-"""`hosts.toml`: which host runs what (docs/hosts.md)."""
+"""`hosts.toml`: the services of each host (docs/hosts.md)."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ class Host(Section, frozen=True):
 
     name: str
     address: str
-    """IP address by which the other hosts dial it."""
+    """IP address at which the other hosts dial this host."""
     ssh: str
-    """Destination for `ssh`: `root@10.0.0.2`, or a name in ~/.ssh/config. It may start units."""
+    """Destination for `ssh`, such as `root@10.0.0.2`, or a name in ~/.ssh/config. This user must be
+    allowed to start systemd units."""
     services: tuple[str, ...]
     tools: tuple[str, ...] = (VIEWER,)
-    """Principals whose key its tools have."""
+    """Principals whose keys the tools on this host have."""
     processors: str = ""
-    """Processors in systemd's notation: `2-3`; empty for all."""
+    """Processors for the services, in systemd's notation, such as `2-3`; empty for all."""
     record: bool = True
-    """If the recorder is on another host: also record this host's services here. That is a reader
-    like any tool, so without a tool's key there is no record."""
+    """If the recorder is on another host, also record this host's services here. This recording
+    needs a tool's key."""
 
     @property
     def processes(self) -> tuple[str, ...]:
@@ -42,18 +43,18 @@ class Host(Section, frozen=True):
 
 
 class Hosts(Section, frozen=True):
-    """The whole file."""
+    """Contents of a hosts file."""
 
     host: tuple[Host, ...]
     first_port: Annotated[int, Range(1024, 65_000, "1")] = 7447
-    """The services' ports follow from here, in the order of the robot's services."""
+    """Port of the first service; the others follow, in the order of `SERVICES`."""
     allow: tuple[str, ...] = ()
-    """Further addresses that may link to the services: those of laptops with tools."""
+    """Addresses of other computers that may link to the services, such as laptops."""
     user: str = "xrl"
-    """User who runs the services."""
+    """User that runs the services."""
     checkout: str = "/opt/xrl"
     folder: str = "/etc/xrl"
-    """Folder of robot file, gain schedule and keys on each host."""
+    """Folder on each host for robot file, gain schedule and keys."""
     ssh: tuple[str, ...] = (
         "ssh", "-o", "BatchMode=yes", "-o", "ConnectTimeout=5", "-o", "ServerAliveInterval=5",
     )  # fmt: skip
@@ -63,7 +64,7 @@ class Hosts(Section, frozen=True):
         return next(host for host in self.host if service in host.services)
 
     def named(self, names: tuple[str, ...]) -> tuple[Host, ...]:
-        """Return hosts by their names; without names, all hosts."""
+        """Return the named hosts; without names, all hosts."""
         known = {host.name: host for host in self.host}
         for name in names:
             if name not in known:
@@ -72,11 +73,11 @@ class Hosts(Section, frozen=True):
 
 
 Problems = Iterator[tuple[str, str, str]]
-"""Key, value found there, and correct value."""
+"""Key, invalid value, and correct value."""
 
 
 def load(path: Path, robot: RobotConfig) -> Hosts:
-    """Read and check a hosts file against the robot that runs on them."""
+    """Read a hosts file, and check it against the robot file."""
     hosts = read_toml(path, Hosts)
     for key, found, right in _problems(hosts, robot):
         raise ConfigError(str(path), key, found, right)
@@ -93,7 +94,7 @@ def _problems(hosts: Hosts, robot: RobotConfig) -> Problems:
         yield "host", f"no host runs {', '.join(absent)}", "each must run on one host"
     for side in SIDES:
         if len({homes.get(name) for name in MODULES if side_of(name) == side}) > 1:
-            right = "use one: they see each other's failures in shared memory (docs/hosts.md)"
+            right = "use one host: they see each other's failures in shared memory (docs/hosts.md)"
             yield "host", f"the {side} leg's services are on several hosts", right
     for index, address in enumerate(hosts.allow):
         yield from _of_address(f"allow[{index}]", address)
@@ -106,7 +107,7 @@ def _problems(hosts: Hosts, robot: RobotConfig) -> Problems:
 
 def _of_host(host: Host, before: tuple[Host, ...], known: tuple[str, ...]) -> Problems:
     if not re.fullmatch(r"[A-Za-z0-9_-]+", host.name):
-        yield "name", f"{host.name!r}", "must have letters, digits, _ and - only"
+        yield "name", f"{host.name!r}", "must have only letters, digits, _ and -"
     yield from _of_address("address", host.address)
     if host.ssh.startswith("-") or not host.ssh.strip():
         yield "ssh", f"{host.ssh!r}", "must be an ssh destination: user@host"
@@ -139,17 +140,17 @@ def _of_address(key: str, text: str) -> Problems:
 
 
 def _real_services(robot: RobotConfig) -> tuple[str, ...]:
-    """Return the services that run on a real robot's hosts."""
+    """Return the services of a real robot."""
     return tuple(service for service in robot.services if service != "simulator")
 
 
 def principals_on(host: Host) -> tuple[str, ...]:
-    """Return the names whose certificates a host needs."""
+    """Return the principals whose certificates a host needs."""
     return tuple(name for name in PRINCIPALS if name in (*host.services, *host.tools))
 
 
 def ports(hosts: Hosts, robot: RobotConfig) -> dict[str, int]:
-    """Return each service's port; an optional service keeps its own whether fitted or not."""
+    """Return the port of each service; the ports do not depend on which services are fitted."""
     return {
         service: hosts.first_port + index
         for index, service in enumerate(SERVICES)

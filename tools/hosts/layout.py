@@ -1,4 +1,4 @@
-"""Each host's files: their contents, their transfer, and the check whether they are right."""
+"""Files of the hosts: contents, transfer and check."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ KEYS: Final = "keys"
 FIREWALL: Final = "xrl.nft"
 UNIT: Final = "xrl.service"
 RUN_DIR: Final = "/var/lib/xrl/run"
-"""On the disk, not in memory: an emergency stop outlasts a power cut once the kernel has written
-it, within half a minute."""
+"""On disk, so that an emergency stop survives a power cut once the kernel has written it (within
+half a minute)."""
 
 NFT: Final = "/usr/sbin/nft"
 
@@ -36,7 +36,7 @@ _SIMULATOR_HOST: Final = "127.0.0.1"
 
 
 def robot_on_hosts(robot: RobotConfig, hosts: Hosts) -> RobotConfig:
-    """Return the robot with each service at its host's address, under `mtls`."""
+    """Return the robot with `mtls` and each service at its host's address."""
     endpoints = {}
     for service, port in ports(hosts, robot).items():
         address = _SIMULATOR_HOST if service == "simulator" else hosts.host_of(service).address
@@ -50,18 +50,18 @@ def robot_on_hosts(robot: RobotConfig, hosts: Hosts) -> RobotConfig:
 def unit(hosts: Hosts, host: Host) -> str:
     """Return the systemd unit that runs a host's services.
 
-    It restarts after a crash and after a power cut, and then arms no drive: a drive that still
-    holds is taken over, and any other waits for a person.
+    It restarts after a crash or a power cut. The services then take over drives that still hold,
+    and arm no other drive.
     """
     xrl = f"{hosts.checkout}/.venv/bin/xrl"
     processors = f"CPUAffinity={host.processors}\n" if host.processors else ""
-    # Joint services discard old frames by restarting the CAN interface (docs/drives.md).
+    # Joint services restart the CAN interface to discard old frames (docs/drives.md).
     granted = "CAP_NET_ADMIN" if set(host.services) & set(MODULES) else ""
     capabilities = f"CapabilityBoundingSet={granted}"
     if granted:
         capabilities += f"\nAmbientCapabilities={granted}"
     return f"""\
-# Made by `xrl hosts`; docs/hosts.md explains it.
+# Made by `xrl hosts` (docs/hosts.md).
 [Unit]
 Description=Extra Robotic Legs: {", ".join(host.services)}
 After=network-online.target
@@ -70,7 +70,7 @@ Wants=network-online.target
 [Service]
 Type=forking
 PIDFile={RUN_DIR}/supervisord.pid
-# As root. If it fails, the services still start: strangers can then only block new links.
+# Runs as root. If it fails, the services still start; strangers can only block new links.
 ExecStartPre=+-{NFT} -f {hosts.folder}/{FIREWALL}
 ExecStart={xrl} up --no-sim --disarmed --config {hosts.folder}/{ROBOT_FILE} \\
   --run-dir {RUN_DIR} --only {",".join(host.processes)}
@@ -80,7 +80,7 @@ RestartSec=2
 # An interrupted start would idle the drives of services that are up.
 TimeoutStartSec=infinity
 TimeoutStopSec=30
-# One process that takes too much memory must not end the others.
+# A process that takes too much memory must not end the others.
 OOMPolicy=continue
 OOMScoreAdjust=-500
 User={hosts.user}
@@ -94,7 +94,7 @@ LimitCORE=0
 {processors}NoNewPrivileges=yes
 {capabilities}
 ProtectSystem=strict
-# for the sockets of the services: `live_dir` in shared/run_directory.py
+# For the sockets of the services: `live_dir` in shared/run_directory.py.
 ReadWritePaths=-/run/lock
 ProtectHome=yes
 ProtectKernelTunables=yes
@@ -111,7 +111,7 @@ WantedBy=multi-user.target
 
 
 def firewall(robot: RobotConfig) -> str:
-    """Return the rules that let only the robot's hosts and `allow` reach the services' ports."""
+    """Return rules that let only the robot's hosts and `allow` reach the services' ports."""
     ends = [host_and_port(endpoint) for endpoint in robot.bus.endpoints.values()]
     addresses = sorted({*(host for host, _ in ends), *robot.bus.security.allow})
     elements = {
@@ -134,12 +134,12 @@ _UNIT_FOLDER: Final = "/etc/systemd/system"
 
 
 class HostFile(NamedTuple):
-    """One file of a host."""
+    """A file for a host."""
 
     path: str
     content: bytes
     of_service: bool = False
-    """True if only the services' user may read it; otherwise it belongs to root."""
+    """True if the file belongs to the services' user, who alone may read it; otherwise to root."""
 
 
 class HostRow(NamedTuple):
@@ -149,9 +149,9 @@ class HostRow(NamedTuple):
     reached: bool = False
     revision: str = ""
     unit: str = "-"
-    """State of its unit by systemd."""
+    """State of its unit as systemd reports it."""
     made_from: tuple[str, str] = ("", "")
-    """Hash of the lock file, and Python's version."""
+    """Hash of the lock file, and Python version."""
     wrong: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -159,7 +159,7 @@ class HostRow(NamedTuple):
 def files_of(
     hosts: Hosts, host: Host, robot: RobotConfig, schedule: bytes, authority: Authority | None
 ) -> list[HostFile]:
-    """Return the files that a host must have; without an authority, all but its keys."""
+    """Return the files that a host must have; its keys are left out if there is no authority."""
     spread = robot_on_hosts(robot, hosts)
     folder = hosts.folder
     files = [
@@ -177,7 +177,7 @@ def files_of(
 
 
 def update(hosts: Hosts, remote: Remote, files: list[HostFile], *, while_up: bool) -> str:
-    """Copy files to a host, and delete keys that it must not have; a start applies them."""
+    """Copy files to a host, and delete keys that it must not have; the next start applies them."""
     if not while_up:
         _refuse_up(remote)
     folder = hosts.folder
@@ -207,21 +207,23 @@ def _refuse_up(remote: Remote) -> None:
     state = _state(remote)
     if state not in _AT_REST:
         raise FleetError(
-            f"{remote.host.name}: its unit is {state}: a service that crashes would restart with "
-            "the new files beside the old; run `xrl hosts down` first, or use --while-up"
+            f"{remote.host.name}: its services may be up (unit: {state}); a service that crashes "
+            "would restart with the new files while the others use the old; run `xrl hosts down` "
+            "first, or use --while-up"
         )
 
 
 def check(hosts: Hosts, remote: Remote, files: list[HostFile]) -> HostRow:
-    """Check a host against the files that it must have."""
+    """Compare a host with the files that it must have."""
     python, config = f"{hosts.checkout}/.venv/bin/python", f"{hosts.folder}/{ROBOT_FILE}"
-    # the module is found in the installed package, wherever the command starts
+    # -P: import the module from the installed package, whatever the working directory
     words = ("-P", "-m", "tools.hosts.probe", "--config", config, "--run-dir", RUN_DIR)
     line = remote.must(python, *words, as_user=True)
     try:
         probe = msgspec.json.decode(line.encode(), type=Probe)
     except msgspec.DecodeError:
-        raise FleetError(f"{remote.host.name}: {hosts.checkout} has another version") from None
+        text = f"{hosts.checkout} has another version; use the same checkout on every host"
+        raise FleetError(f"{remote.host.name}: {text}") from None
     wanted = {Path(file.path).name: digest(file.content) for file in files if not file.of_service}
     wrong = list(probe.wrong)
     if probe.robot != wanted[ROBOT_FILE]:
@@ -270,7 +272,7 @@ def _state(remote: Remote) -> str:
 
 
 def disagreements(rows: list[HostRow]) -> list[str]:
-    """Return the values that differ between the hosts that were reached."""
+    """Return a line for each value that differs between the reachable hosts."""
     wrong = []
     for word, value_of in _SAME_ON_ALL.items():
         found = {row.name: value_of(row) for row in rows if row.reached}

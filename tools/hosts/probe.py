@@ -1,4 +1,4 @@
-"""Self-check of a host for `xrl hosts check`: one line of JSON.
+"""Check this host for `xrl hosts check`, and print the result as one line of JSON.
 
 python -m tools.hosts.probe --config /etc/xrl/robot.toml --run-dir /var/lib/xrl/run
 """
@@ -28,15 +28,15 @@ from tools.keys.authority import held_files
 from tools.keys.inspection import inspect_keys
 
 FREE_MIB: Final = 4096
-"""Free space below which it warns, MiB: an hour of records is 2.4 GiB."""
+"""Free space below which a warning is given, MiB; an hour of recording takes 2.4 GiB."""
 LOCKS: Final = ("requirements.lock", "requirements.runtime.lock")
 
 
 class Probe(msgspec.Struct, frozen=True):
-    """Facts that a host reports about itself."""
+    """State of a host."""
 
     revision: str
-    """Commit of the code, with "+" if it has changes; empty if unknown."""
+    """Commit of the code, with "+" for local changes; empty if unknown."""
     lock: str
     """Hash of the lock file of the runtime environment."""
     python: str
@@ -45,9 +45,9 @@ class Probe(msgspec.Struct, frozen=True):
     schedule: str
     """Hash of the gain schedule; empty without one."""
     keys: dict[str, str]
-    """Hash of each key file, by its name."""
+    """Hashes of the key files, by name."""
     wrong: tuple[str, ...]
-    """Problems that keep the services from starting: the robot file, keys."""
+    """Faults of robot file or keys that prevent a start of the services."""
     warnings: tuple[str, ...]
 
 
@@ -93,7 +93,7 @@ def probe(config: Path, run_dir: Path) -> Probe:
 
 
 def digest(content: bytes) -> str:
-    """Return the hash by which files of several hosts are compared."""
+    """Return a hash for comparing files of several hosts."""
     return hashlib.sha256(content).hexdigest()[:16]
 
 
@@ -105,7 +105,7 @@ def _hash_of(path: Path) -> str:
 
 
 def _is_older(path: Path, other: Path) -> bool:
-    """Return True if a file is there and was written before another."""
+    """Return True if both files exist and the first is older."""
     try:
         return path.stat().st_mtime < other.stat().st_mtime
     except OSError:
@@ -113,7 +113,7 @@ def _is_older(path: Path, other: Path) -> bool:
 
 
 def _environment_is_current() -> bool:
-    """Return True if this environment was made from this checkout's lock file (deploy/lib.sh)."""
+    """Return True if this environment was made from the checkout's lock file (deploy/lib.sh)."""
     try:
         made_from = Path(sys.prefix, "xrl.stamp").read_text(encoding="utf-8").split()
         rest = (CHECKOUT / "pyproject.toml").read_bytes()
@@ -132,7 +132,7 @@ def _revision() -> str:
 
 
 def main() -> None:
-    """Print what this host reports about itself."""
+    """Print the state of this host."""
     parser = FlagParser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--run-dir", type=Path, required=True)

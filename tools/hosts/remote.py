@@ -1,4 +1,4 @@
-"""Commands on a host, over the system's ssh."""
+"""Run commands on a host with the system's ssh."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 TIMEOUT_S: Final = 90.0
 MARK: Final = "xrl-output-follows"
-"""Line before a command's own output: a host's .bashrc may print lines before it."""
+"""Line printed before a command's output: a host's .bashrc may print other lines first."""
 
 
 class Said(NamedTuple):
@@ -33,21 +33,21 @@ class _Manner(TypedDict, total=False):
     content: bytes
     """Data for its standard input."""
     as_user: bool
-    """True to run it as the user who runs the services, not as the login user."""
+    """True to run the command as the services' user, not as the login user."""
     timeout_s: float
 
 
 class Remote:
-    """One host, by ssh."""
+    """One host, reached by ssh."""
 
     def __init__(self, hosts: Hosts, host: Host) -> None:
         self.host = host
         self._begin = [*hosts.ssh, host.ssh]
-        # from a folder that every user may enter: find and others return to where they started
+        # in a folder that every user may enter, because `find` returns to its start folder
         self._as_user = ["env", "-C", "/", "runuser", "-u", hosts.user, "--"]
 
     def run(self, *words: str, **manner: Unpack[_Manner]) -> Said:
-        """Run a command without shell expansion, and wait for it; its failure is not an error.
+        """Run a command without shell expansion, and wait for it. A failed command raises no error.
 
         Raises:
             FleetError: the host cannot be reached, or the command does not end in time.
@@ -64,7 +64,7 @@ class Remote:
         except OSError as error:
             raise FleetError(f"{name}: {command[0]}: {error.strerror}") from None
         errors = done.stderr.decode(errors="replace").strip()
-        if done.returncode == 255:  # ssh's own
+        if done.returncode == 255:  # the exit code of ssh itself
             raise FleetError(f"{name}: {self.host.ssh} cannot be reached: {_last(errors)}")
         noise, mark, out = done.stdout.decode(errors="replace").partition(f"{MARK}\n")
         if not mark:
@@ -73,7 +73,7 @@ class Remote:
         return Said(done.returncode, out, errors)
 
     def follow(self, *words: str, tell: Callable[[str], None], **manner: Unpack[_Manner]) -> None:
-        """Run a command, and pass on each line as it is printed.
+        """Run a command, and pass each line of its output to `tell`.
 
         Raises:
             FleetError: the host cannot be reached, or the command fails.
@@ -96,7 +96,7 @@ class Remote:
             raise FleetError(f"{name}: {_last(errors)}")
 
     def _command(self, words: Sequence[str], manner: _Manner) -> list[str]:
-        """Return the local command that runs words on the host; they print after `MARK`."""
+        """Return the local command that prints `MARK` and runs words on the host."""
         before = self._as_user if manner.get("as_user") else []
         return [*self._begin, f"echo {MARK}; {shlex.join([*before, *words])}"]
 
@@ -109,7 +109,7 @@ class Remote:
         return said.out
 
     def write(self, path: str, content: bytes, *, private: bool) -> None:
-        """Write a file whole or not at all; a private file belongs to the services' user alone."""
+        """Write a file atomically; only the services' user can read a private file."""
         part, mode = shlex.quote(f"{path}.part"), 0o600 if private else 0o644
         script = (
             f"umask 077 && rm -f {part} && set -C && cat > {part} && chmod {mode:o} {part} && "
@@ -119,7 +119,7 @@ class Remote:
 
 
 def _skip_noise(lines: Iterable[str]) -> None:
-    """Read up to the line before a command's own output, or to the end."""
+    """Skip lines up to `MARK`, or to the end."""
     for line in lines:
         if line.endswith(f"{MARK}\n"):
             return
@@ -130,7 +130,7 @@ def on_all(
     work: Callable[[Remote], R],
     tell: Callable[[str, R | FleetError], None] = lambda _name, _result: None,
 ) -> dict[str, R | FleetError]:
-    """Do the same on all hosts at once; a host that fails gives its error."""
+    """Run `work` on all hosts at once; return the result or the error of each."""
 
     def attempt(remote: Remote) -> R | FleetError:
         try:

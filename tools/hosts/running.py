@@ -1,4 +1,4 @@
-"""Starts, stops and queries the services of hosts, through their systemd units."""
+"""Start, stop and query the services of hosts through their systemd units."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from tools.hosts.remote import Remote
 HEARD_S: Final = 10.0
 """Timeout for the first state of a joint service, s."""
 ESTOP_S: Final = 10.0
-"""Timeout for a host's answer, s; a host that has not answered has not stopped."""
+"""Timeout for a host's answer to an emergency stop, s; without an answer, its modules may not have
+stopped."""
 _ARMABLE: Final = (DriveStatus.IDLE.name, DriveStatus.ERROR.name)
 
 
 def start(remote: Remote) -> str:
-    """Start a host's services; they take over a drive that holds, and arm none."""
+    """Start a host's services, which take over drives that hold, and arm none."""
     remote.must("systemctl", "start", UNIT)
     return f"up: {', '.join(remote.host.services)}"
 
 
 def heard(hosts: Hosts, remote: Remote) -> FleetStatus:
-    """Return a host's status, once each of its own modules reports."""
+    """Return a host's status once all its own modules send states."""
     deadline = time.monotonic() + HEARD_S
     while True:
         found = status(hosts, remote)
@@ -46,7 +47,7 @@ def heard(hosts: Hosts, remote: Remote) -> FleetStatus:
 
 
 def stopped_in(found: Iterable[FleetStatus]) -> dict[str, str]:
-    """Return each module in an emergency stop, with who engaged it, or ""."""
+    """Return the modules in an emergency stop, each with the person who requested it, or ""."""
     stopped: dict[str, str] = {}
     for one in found:
         for name, row in one.modules.items():
@@ -56,7 +57,7 @@ def stopped_in(found: Iterable[FleetStatus]) -> dict[str, str]:
 
 
 def arm(hosts: Hosts, remote: Remote, found: FleetStatus) -> str:
-    """Have the host's joint services arm their idle drives; a drive that holds is left alone."""
+    """Let the host's joint services arm drives that are IDLE or in ERROR, and no others."""
     idle = [name for name in _modules_of(remote) if found.modules[name].drive in _ARMABLE]
     for module in idle:
         remote.must(_xrl(hosts), "kill", module, "--run-dir", RUN_DIR, as_user=True)
@@ -68,7 +69,7 @@ def _modules_of(remote: Remote) -> list[str]:
 
 
 def estop(hosts: Hosts, remote: Remote) -> str:
-    """Stop a host's modules, through its shared memory."""
+    """Stop a host's modules through its shared memory."""
     mine = _modules_of(remote)
     if not mine:
         return "no module here"
@@ -79,10 +80,10 @@ def estop(hosts: Hosts, remote: Remote) -> str:
 def lower(
     hosts: Hosts, remotes: Iterable[Remote], tell: Callable[[str], None], *, wait_s: float
 ) -> None:
-    """Have one host lower the robot until its legs bear no weight; do nothing if no host is up.
+    """Lower the robot from one host until its legs bear no weight; do nothing if no host is up.
 
     Raises:
-        FleetError: the legs bear weight, or that is unknown.
+        FleetError: the legs bear weight, or it is unknown whether they do.
     """
     try:
         up = [remote for remote in remotes if is_up(remote)]
@@ -92,11 +93,13 @@ def lower(
         words = ("down", "--lower-only", "--wait", f"{wait_s:g}", "--run-dir", RUN_DIR)
         first.follow(_xrl(hosts), *words, tell=tell, as_user=True)
     except FleetError as error:
-        raise FleetError(f"nothing was stopped: {error} (here: `xrl hosts down --limp`)") from None
+        again = "run `xrl hosts down` again, or `xrl hosts down --limp` to let the robot drop"
+        text = f"nothing was stopped: {error}. From this computer, {again}"
+        raise FleetError(text) from None
 
 
 def down(hosts: Hosts, remote: Remote) -> str:
-    """Stop a host's services, and clear an emergency stop, because a person requests that."""
+    """Stop a host's services, and clear an emergency stop, because a person requests it."""
     remote.must("systemctl", "stop", UNIT)
     remote.must(_xrl(hosts), "down", "--limp", "--run-dir", RUN_DIR, as_user=True)
     return "down"
@@ -113,7 +116,7 @@ def status(hosts: Hosts, remote: Remote) -> FleetStatus:
 
 
 def joined(found: dict[str, FleetStatus]) -> FleetStatus:
-    """Return one status of all hosts; each module's is from the first host that receives it."""
+    """Return one status for all hosts; each module's is from the first host that receives it."""
     services = {
         f"{host}: {name}": row for host, one in found.items() for name, row in one.services.items()
     }

@@ -1,1 +1,1 @@
-"""Judgement of a run: verdict, soundness, stalls, figures, report."""
+"""Judges a run: verdict, figures, picture and report page."""

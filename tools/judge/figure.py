@@ -1,4 +1,4 @@
-"""Files that a judged run leaves beside its log: `summary.json` and the picture `run.png`.
+"""Judges a run, and writes `summary.json` and the picture `run.png` beside its log.
 
 The picture resembles the paper's Fig. 7: COM and torso angles against time.
 """
@@ -179,7 +179,7 @@ def _events(axes: Any, events: Sequence[TimelineEvent], length_s: float) -> None
 
 
 def _stalls(axes: Any, stalls: Sequence[ShownStall]) -> None:
-    """Shade stalls, and the time that is judged separately because of them."""
+    """Shade stalls, and the time that led and held figures exclude because of them."""
     for row in stalls:
         end = row.at_s + row.lasted_ms / 1e3
         apart = row.apart_until_s if row.modules_held else end

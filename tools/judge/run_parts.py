@@ -19,10 +19,10 @@ class PartFlags(Flags):
     """Part of a run; by default all of it."""
 
     begin_s: Annotated[Number, option("--from", metavar="S")] = -math.inf
-    """start of the part (default: the run's): scenario time, or time since the start of the log if
-    it has no scenario; as in the report"""
+    """start: scenario time, or time since the log's start if it has no scenario (default: the run's
+    start)"""
     end_s: Annotated[Number, option("--to", metavar="S")] = math.inf
-    """end of the part (default: the run's)"""
+    """end (default: the run's end)"""
 
     def check(self) -> None:
         """Refuse an empty part."""
@@ -41,9 +41,9 @@ def part_of(flags: PartFlags, index: RunIndex) -> RunPart:
     offset_s = (zero_ns(index) - index.span_ns[0]) / 1e9
     first_s, last_s = 0.0 - offset_s, index.length_s - offset_s  # no -0
     if begin_s > last_s or end_s < first_s:
+        asked = f"after {begin_s:g}" if begin_s > last_s else f"before {end_s:g}"
         raise RunError(
-            f"{index.path}: has nothing from {begin_s:g} to {end_s:g} s; it covers "
-            f"{first_s:.2f} to {last_s:.2f} s"
+            f"{index.path}: has nothing {asked} s; it covers {first_s:.2f} to {last_s:.2f} s"
         )
     return RunPart(max(0.0, begin_s + offset_s), end_s + offset_s)
 

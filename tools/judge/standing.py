@@ -51,21 +51,21 @@ LIMITS: Final = (
     VerdictLimit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
     VerdictLimit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
 )
-"""Live targets. Only `stood` decides the exit code: the run reached its end, the robot stands there
-(`tools.judge.standing`), and it stood soundly throughout (`SOUND`). `led`: all six modules track,
-before any kill; `held`: after a kill, or in HOLD because of an impaired network. The consequences
-of a stall of the machine count as neither (`tools.fleet.stalls`)."""
+"""Live targets. Only `Summary.sound` decides the exit code: the robot stands at the end of the run,
+and stood soundly throughout (`SOUND`). `led`: before any kill and, in a run with network
+impairments, only while all six modules track; `held`: at all other times. The consequences of a
+stall of the machine count as neither (`tools.fleet.stalls`)."""
 
 BY_KEY: Final = {row.key: row for row in LIMITS}
 
 SOUND: Final = ("torque_at_limit_ms", "shaking_nm", "sinking_m_s", "overforce_s")
-"""A run in which one of these exceeds its limit did not stand. On the limit of sinking: a person
-who catches up with a robot that held leads it down at up to 0.73 m/s (`bad_network`)."""
+"""A run in which one of these exceeds its limit is not sound. A person who catches up with a robot
+that held leads it down at up to 0.73 m/s (`bad_network`), which the limit of sinking allows."""
 
 
 OVERFORCE_N: Final = 100.0
-"""Force of the hand along z. A led robot yields to 20 N; over 100 N for longer than a second means
-that it follows something else, such as a faulty harness sensor."""
+"""Force of the hand along z. A led robot yields to 20 N; a force over 100 N for longer than a
+second means that it follows something else, such as a faulty harness sensor."""
 SOLE_TILT_MAX: Final = 0.05
 """rad; a sole tilted by more than this does not settle on its own."""
 TURNED_MAX: Final = 0.3
@@ -91,7 +91,7 @@ def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
 
 
 BREAK_S: Final = 0.05
-"""Longest gap between states, s; across a longer gap nothing is known."""
+"""A longer gap between states interrupts a figure, s."""
 SINK_OVER_S: Final = 0.1
 """Time over which sinking is measured, s; a sole's touchdown or a blow is faster."""
 _HELD: Final = (Mode.HOLD, Mode.TRACK, Mode.DAMP)
@@ -107,7 +107,7 @@ class Soundness(NamedTuple):
 
 
 def soundness(log: RunLog, truth: Sequence[SimTruth], robot: RobotConfig) -> Soundness:
-    """Return the figures of a run from its first row onwards."""
+    """Return the figures of a run from the first row of `truth` onwards."""
     start_ns = truth[0].t_ns
     longest, shaking = [], []
     for module in MODULES:
@@ -174,7 +174,7 @@ def shaking_of(t_ns: NDArray[np.int64], tau: Array) -> Array:
 
 
 def _longest_s(t_ns: NDArray[np.int64], true: NDArray[np.bool_]) -> float:
-    """Return the longest time that is true without a break, s."""
+    """Return the longest uninterrupted time of True, s."""
     longest_ns, since_ns, last_ns = 0, -1, 0
     for at_ns, is_true in zip(t_ns.tolist(), true.tolist(), strict=True):
         broken, last_ns = at_ns - last_ns > BREAK_S * NS_PER_S, at_ns

@@ -1,6 +1,6 @@
-"""Judges a run by figures from its log alone, and compares them with their limits.
+"""Computes the figures of a run from its log, and judges the run.
 
-All figures come from the MCAP file, so a run can be judged again at any time.
+The verdict needs only the MCAP file, so a run can be judged again at any time.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from tools.logs.run_log import RunLog, parts_of, robot_of
 KILLED, RESTARTED = RunEventKind.KILLED, RunEventKind.RESTARTED
 REAL_TIME_FACTOR_MIN: Final = 0.99
 NEXT_CYCLE_MS: Final = 2.0
-"""In virtual time a module detects the end of a process on its host in its next cycle, after up to
-this time, ms, so such a value is not a measurement."""
+"""In virtual time a module detects the end of a process on its host in its next cycle, within this
+time, ms. A value up to this is therefore not a measurement."""
 LATE_MAX_S: Final = 0.05
-"""If more world time than this is given up, the run was not in real time, s."""
+"""Maximum world time that a run in real time may give up, s."""
 
 
 class Percentiles(msgspec.Struct, frozen=True):
@@ -53,7 +53,7 @@ class ShownStall(msgspec.Struct, frozen=True):
     at_s: float
     lasted_ms: float
     apart_until_s: float
-    """End of the time that is judged separately."""
+    """End of the time that led and held figures exclude."""
     modules_held: int
     said: str
     """The stall as a line of text."""
@@ -104,7 +104,7 @@ class Summary(msgspec.Struct, kw_only=True):
     pitch_max_rad: Largest = None
     yaw_max_rad: Largest = None
     hold_com_x_max_mm: Largest = None
-    """`hold_`: while no planner leads; `alive_`: while it leads, relative to the hand's request."""
+    """`hold_`: while held; `alive_`: while led, relative to the requested shift (`LIMITS`)."""
     hold_com_y_max_mm: Largest = None
     hold_roll_max_rad: Largest = None
     hold_pitch_max_rad: Largest = None
@@ -145,7 +145,7 @@ class Summary(msgspec.Struct, kw_only=True):
     stopped: list[str] = []
     """Processes that were suspended."""
     messages_recorded: int = 0
-    """Up to the end of the last part, as for the gaps."""
+    """Up to the end of the last part, as for `sequence_gaps`."""
     sequence_gaps: int = 0
     stalls: Annotated[list[ShownStall], _each_stall] = []
     wearer: Annotated[WearerFigures | None, merged_figures] = None
@@ -274,7 +274,7 @@ def merged(parts: Sequence[Summary]) -> Summary:
 
 
 def fell(summary: Summary) -> bool:
-    """Return True if the robot has fallen, or cannot recover."""
+    """Return True if the robot has fallen, or is about to fall."""
     return summary.fallen_at_s is not None or bool(summary.why_not)
 
 
@@ -380,7 +380,7 @@ POSES: Final = (
 
 
 def _requested(log: RunLog, truth: Sequence[SimTruth]) -> Array:
-    """Return the operator's requests for the closed directions, with the planner's reference rate.
+    """Return the requested shift, as the planner's rate-limited reference, at each row.
 
     (n, 6): COM x, y over the floor along gravity, z, roll, pitch, yaw; zeros where nothing is
     requested.
@@ -415,8 +415,8 @@ def _assist_error(truth: Sequence[SimTruth]) -> float | None:
 def leading(log: RunLog, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return, for each time, True if the limits of a leading planner apply.
 
-    They apply until the first kill. While the network is impaired on purpose, they apply only while
-    all six modules track, since HOLD is expected. A dropout at any other time is judged.
+    They apply until the first kill. In a run with network impairments, they apply only while all
+    six modules track, since HOLD is expected. In any other run, they also apply during dropouts.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     kills = [row.t_ns for row in events if row.kind == KILLED]

@@ -80,7 +80,10 @@ def rows(summary: Summary) -> list[tuple[str, str, str, str]]:
 
 
 def mark(row: VerdictLimit, summary: Summary) -> str:
-    """Return the verdict on a figure: `ok`, or `over`, possibly with a reason."""
+    """Return the verdict on a figure: `ok`, or `over`, possibly with a reason.
+
+    For messages that a stopped service lost, it is the reason without `over`.
+    """
     if getattr(summary, row.key) <= row.limit:
         return OK
     if row.key == "sequence_gaps" and summary.stopped:
@@ -96,7 +99,7 @@ def stalls(summary: Summary) -> list[str]:
     rest = [row.lasted_ms for row in summary.stalls if not row.modules_held]
     lines = told[:STALLS_MAX]
     if len(told) > STALLS_MAX:
-        lines.append(f"{len(told) - STALLS_MAX} more stalls with consequences")
+        lines.append(f"more stalls with consequences: {len(told) - STALLS_MAX}")
     if rest:
         lines.append(f"Stalls of the machine without consequence: {len(rest)}, at most "
                      f"{max(rest):.0f} ms")  # fmt: skip

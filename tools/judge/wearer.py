@@ -11,7 +11,7 @@ requested assist. v and omega are the rates of the harness point and of the tors
     bump    = |f - f, low-passed by `SLOW_S`| > `BUMP_N` for less than `BUMP_S`
     resting : -f > `RESTS_N` while the robot is still
 
-The forces include those of the hand: while it leads, the person's push up or down is part of them.
+While the hand leads, its force is part of f.
 
 `thresholds_of` measures what park must know about a person (docs/law.md#park), from a log in which
 they stood, squatted and rested. It measures how hard they pull when they lead up, how hard they
@@ -55,7 +55,7 @@ PAUSE_MARGIN: Final = 1.25
 PAUSE_MAX_S: Final = 2.0
 STILL_MIN_S: Final = 0.5
 LEADS_FROM_S: Final = 0.4
-"""A person pulls before and after the robot moves; neither time counts as rest, s."""
+"""Time before and after a motion that does not count as rest, because the person may pull, s."""
 GRID_S: Final = 0.04
 """Rates are differences over this time, s."""
 PHASES: Final = ("stand", "down", "work", "up")
@@ -93,7 +93,9 @@ class WearerFigures(msgspec.Struct, frozen=True, kw_only=True):
         each = ", ".join(
             f"{name} {100 * row.share:.0f} %" for name, row in self.phases.items() if name != "all"
         )
-        bumps = f"{self.bumps} bumps of {self.bump_peak_n:.0f} N" if self.bumps else "no bumps"
+        bumps = "no bumps"
+        if self.bumps:
+            bumps = f"{self.bumps} bump{'s' * (self.bumps > 1)} of up to {self.bump_peak_n:.0f} N"
         return (
             f"The wearer: the robot carried {100 * whole.share:.0f} % of {whole.asked_n:.0f} N "
             f"({each}); force {self.force_rms_n:.1f} N rms, at most {self.force_peak_n:.0f} N, "
@@ -157,7 +159,7 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
     """
     motion, felt = _read(log, robot)
     if motion is None or felt is None:
-        raise RunError(f"{log.path}: has no harness, planner and joints, or was never led")
+        raise RunError(f"{log.path}: lacks data of harness, planner or joints, or was never led")
     led, phase = motion.led, motion.phase
     still = led & motion.still
     rests = _eroded(still, round(LEADS_FROM_S / GRID_S))
@@ -165,9 +167,10 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
     pauses = _pauses(np.where(led, phase, -1), motion.t_ns / NS_PER_S)
     if len(pauses) < SQUATS_MIN or work_s < WORK_MIN_S:
         raise RunError(
-            f"{log.path}: while led, it holds {len(pauses)} squats and {work_s:.0f} s at rest in a "
-            f"crouch; {SQUATS_MIN} and {WORK_MIN_S:.0f} s are needed. Record again with park off: "
-            "stand, squat three times without stopping, then rest in a crouch"
+            f"{log.path}: too little motion while led: squats: {len(pauses)}, at least "
+            f"{SQUATS_MIN} needed; rest in a crouch: {work_s:.0f} s, at least "
+            f"{WORK_MIN_S:.0f} s needed. Record again with park off: stand, squat three times "
+            "without stopping, then rest in a crouch"
         )
     up, idle = (led & (phase == PHASES.index("up")))[felt.at], rests[felt.at]
     park, doubts = robot.park, []

@@ -1,1 +1,1 @@
-"""A robot's authority, its certificates, and each host's bundle of them (docs/security.md)."""
+"""Authority, certificates and key bundles of a robot (docs/security.md)."""

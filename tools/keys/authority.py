@@ -1,7 +1,7 @@
 """Folder of a robot's authority, and the bundles that it makes for hosts.
 
-The authority signs certificates, and never leaves its machine. A host's bundle has certificates and
-keys of what the host runs, and never the authority's key.
+The authority signs certificates. Its key never leaves its computer: a host's bundle has only the
+keys of the host's own processes.
 
 authority.key, authority.pem    the authority
 names.toml                      the current generation of each name
@@ -38,32 +38,32 @@ def default_folder(robot: RobotConfig) -> Path:
 
 
 class Authority:
-    """A robot's authority, as its folder holds it."""
+    """Authority of a robot, read from its folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.names = credentials.read_names(folder)
         key = folder / _KEY
         if not key.is_file():
-            raise BusError(f"{key}: missing, so this folder cannot sign; give --authority")
+            raise BusError(f"{key}: missing, so this folder cannot sign; give another --authority")
         credentials.check_private(key)
         self._issued = Issued((folder / credentials.AUTHORITY).read_bytes(), key.read_bytes())
 
     @property
     def certificate(self) -> bytes:
-        """The authority's own certificate, PEM."""
+        """Certificate of the authority, PEM."""
         return self._issued.certificate
 
     def renew(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Issue new certificates and keys in the current generation; the old ones stay valid."""
+        """Issue new certificates and keys in the current generation; old ones remain accepted."""
         self._issue(robot, {name: self.names.generations.get(name, 1) for name in names}, days)
 
     def revoke(self, robot: RobotConfig, names: Iterable[str], days: int) -> None:
-        """Issue the next generation; once all hosts know of it, none accepts the old one."""
+        """Issue the next generation; hosts with the new `names.toml` refuse the old one."""
         self._issue(robot, {n: self.names.generations.get(n, 0) + 1 for n in names}, days)
 
     def _issue(self, robot: RobotConfig, generations: Mapping[str, int], days: int) -> None:
-        """Issue all certificates, then write them, and last the generations that are accepted."""
+        """Issue all certificates, write them, and then write the accepted generations."""
         now = dt.datetime.now(dt.UTC)
         issued = {
             name: certificates.issue(
@@ -82,10 +82,10 @@ def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
     """Create a robot's authority and a certificate for each name."""
     if (folder / _KEY).exists():
         right = "`xrl keys renew` makes new certificates, `xrl keys revoke` revokes old ones"
-        raise BusError(f"{folder}: has an authority already; {right}")
+        raise BusError(f"{folder}: already has an authority; {right}")
     names = Names(robot.name, dict.fromkeys(principals_of(robot), 1))
     for name in names.generations:
-        hosts_of(robot, name)  # before anything is written
+        hosts_of(robot, name)  # raise before anything is written
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)
@@ -101,26 +101,26 @@ def make(folder: Path, robot: RobotConfig, days: int) -> Authority:
 
 
 def principals_of(robot: RobotConfig) -> tuple[str, ...]:
-    """Return every name that a robot's certificates have."""
+    """Return the names of all certificates of a robot."""
     return tuple(n for n in PRINCIPALS if n not in SERVICES or n in robot.services)
 
 
 def hosts_of(robot: RobotConfig, name: str) -> tuple[str, ...]:
-    """Return the host by which a service is dialled; empty for tools, which listen nowhere."""
+    """Return the host of a service's endpoint; empty for tools, which do not listen."""
     if name not in SERVICES:
         return ()
     endpoint = robot.bus.endpoints[name]
     found = re.fullmatch(r"tls/\[?([^\]]+?)\]?:\d+", endpoint)
     if found is None:
         raise BusError(
-            f"bus.endpoints.{name}: {endpoint!r} has no certificate; must be tls/HOST:PORT, "
-            "or give --hosts FILE for a robot on several hosts"
+            f"bus.endpoints.{name}: {endpoint!r} cannot have a certificate; must be tls/HOST:PORT. "
+            "For a robot on several hosts, give --hosts FILE"
         )
     return (found[1],)
 
 
 def bundle(authority: Authority, names: Iterable[str]) -> dict[str, bytes]:
-    """Return the files of a bundle by their names."""
+    """Return the files of a bundle, by name."""
     folder = authority.folder
     files = {
         credentials.AUTHORITY: authority.certificate,
@@ -139,7 +139,7 @@ def bundle(authority: Authority, names: Iterable[str]) -> dict[str, bytes]:
 
 
 def to_tar(files: dict[str, bytes]) -> bytes:
-    """Return a tar file that unpacks into one folder; only its owner can read the files."""
+    """Return a tar file of the folder `keys`, whose files only their owner can read."""
     written = io.BytesIO()
     with tarfile.open(fileobj=written, mode="w") as tar:
         for name, content in files.items():
@@ -155,7 +155,7 @@ def held_files(folder: Path) -> list[str]:
 
 
 def install(files: dict[str, bytes], folder: Path) -> None:
-    """Write a bundle into this host's folder of keys, and delete keys that are not in it."""
+    """Write a bundle into this host's folder of keys, and delete keys that the bundle lacks."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.chmod(0o700)

@@ -1,4 +1,4 @@
-"""X.509 certificates on P-256, for rustls, which is Zenoh's TLS."""
+"""X.509 certificates on P-256 for Zenoh's TLS library, rustls."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 AUTHORITY_DAYS: Final = 3650
 CERTIFICATE_DAYS: Final = 730
 _EARLIER: Final = dt.timedelta(days=1)
-"""A certificate is valid from a day before it was made, because hosts' clocks differ."""
+"""Certificates become valid one day before they are made, because hosts' clocks differ."""
 
 
 class Issued(NamedTuple):
@@ -36,7 +36,7 @@ class Details(NamedTuple):
 
 
 def make_authority(robot: str, now: dt.datetime) -> Issued:
-    """Return a new authority: it signs a robot's certificates and nothing else."""
+    """Return a new authority for the certificates of one robot."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(f"{robot} authority")
     usage = x509.KeyUsage(
@@ -60,14 +60,14 @@ def issue(
     now: dt.datetime,
     days: int = CERTIFICATE_DAYS,
 ) -> Issued:
-    """Return a new certificate for both sides of a link.
+    """Return a new certificate, for the dialling or the listening side of a link.
 
-    The access rules use its common name (`shared.bus.security.common_name`). The dialling side
+    The access rules use the common name (`shared.bus.security.common_name`). The dialling side
     checks the names and addresses in `hosts`.
     """
     signer = serialization.load_pem_private_key(authority.key, password=None)
     if not isinstance(signer, ec.EllipticCurvePrivateKey):
-        raise TypeError("the authority's key is not on P-256")
+        raise TypeError("the authority's key is not an elliptic-curve key")
     parent = x509.load_pem_x509_certificate(authority.certificate)
     key = ec.generate_private_key(ec.SECP256R1())
     usages = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -110,7 +110,7 @@ def is_signed_by(certificate: bytes, authority: bytes) -> bool:
 
 
 def is_key_of(key: bytes, certificate: bytes) -> bool:
-    """Return True if a private key is that of a certificate."""
+    """Return True if a private key belongs to a certificate."""
     try:
         own = serialization.load_pem_private_key(key, password=None).public_key()
     except (ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""Check of a host's keys, for `xrl keys check` and `xrl doctor`."""
+"""Check a host's keys for `xrl keys check`, `xrl doctor` and `xrl hosts check`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tools.keys.certificates import Details
 _DAY: Final = "%Y-%m-%d"
 _TIME: Final = "%Y-%m-%d %H:%M UTC"
 WARN_DAYS: Final = 60
-"""Days before its expiry from which a certificate causes a warning."""
+"""Time before expiry at which warnings begin, days."""
 
 
 class KeyRow(NamedTuple):
@@ -29,12 +29,12 @@ class KeyRow(NamedTuple):
     expires: str
     hosts: tuple[str, ...]
     wrong: str = ""
-    """Why it cannot be used; empty if it can."""
+    """Reason why it cannot be used, or ""."""
     warning: str = ""
 
 
 def inspect_keys(folder: Path, robot: RobotConfig) -> list[KeyRow]:
-    """Return a row for each certificate in a folder, the authority's own first."""
+    """Return a row for each certificate in a folder; the authority's is first."""
     names = credentials.read_names(folder)
     if names.robot != robot.name:
         right = f"must be those of {robot.name!r}"
@@ -43,7 +43,9 @@ def inspect_keys(folder: Path, robot: RobotConfig) -> list[KeyRow]:
         authority = (folder / credentials.AUTHORITY).read_bytes()
         signer = certificates.read(authority)
     except (OSError, ValueError) as error:
-        raise BusError(f"{folder / credentials.AUTHORITY}: not a certificate: {error}") from None
+        raise BusError(
+            f"{folder / credentials.AUTHORITY}: cannot be read as a certificate: {error}"
+        ) from None
     held = [name for name in names.generations if key_file(folder, name).exists()]
     if not held:
         raise BusError(f"{folder}: has no certificate of a process; run `xrl keys pack`")
@@ -52,7 +54,7 @@ def inspect_keys(folder: Path, robot: RobotConfig) -> list[KeyRow]:
 
 
 def _validity(found: Details, renewal: str) -> tuple[str, str]:
-    """Return the error of a certificate's validity by this host's clock, and a warning."""
+    """Return a fault and a warning about a certificate's dates by this host's clock, or ""."""
     now = dt.datetime.now(dt.UTC)
     left = found.expires - now
     if now < found.begins:
@@ -62,7 +64,7 @@ def _validity(found: Details, renewal: str) -> tuple[str, str]:
         wrong = f"expired at {found.expires:{_TIME}}, but this host's clock says {now:{_TIME}}"
         return f"{wrong}: no new link is possible; {renewal}", ""
     if left < dt.timedelta(days=WARN_DAYS):
-        return "", f"expires in {left.days} days; {renewal}"
+        return "", f"expires in {left.days} day{'s' * (left.days != 1)}; {renewal}"
     return "", ""
 
 

@@ -1,1 +1,1 @@
-"""Laboratory for researchers: gain design, studies, benches, learning. A robot does not need it."""
+"""Research tools: gain design, studies and benchmarks. A robot does not need them."""

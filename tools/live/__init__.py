@@ -1,1 +1,1 @@
-"""The experiment on a live fleet of processes: start it, watch it, impair it."""
+"""Experiments on a live fleet of processes: start, watch and impair them."""

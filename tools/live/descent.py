@@ -1,11 +1,11 @@
-"""The robot's way down, and the wait until its weight is taken, before its drives go limp.
+"""Descent of the robot, and the wait until a hoist takes its weight, before its drives go limp.
 
-The robot's feet are under shins of a metre. If it is idled in its lowest pose, it tips over as it
-does from a stand: the torso hits the floor at 2.8 to 3.1 m/s either way. So the descent ends with
-a robot that still holds, and the drives idle only after a hoist or a stand carries it.
+Idling the drives in the lowest pose would not be gentle: the shins are a metre long, so the robot
+tips over as from a stand, and the torso hits the floor at 2.8 to 3.1 m/s either way. So the robot
+holds at the end of the descent, and its drives idle only after a hoist or a stand carries it.
 
-`Descent` is its law, without bus or clock. The joints' torques show whether the robot carries
-weight; an unknown load counts as weight.
+`Descent` makes the decisions, without bus or clock. The joints' torques show whether the robot
+carries weight; an unknown load counts as weight.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ WAYS: Final = (
     "`xrl down --limp` to let it drop"
 )
 LIGHT_FRACTION: Final = 0.25
-"""Fraction of the torso's weight in the robot file; with less on its legs the robot hangs. Without
-its payload, half of the weight is left."""
+"""With less than this fraction of the torso's weight on its legs, the robot hangs. Without its
+payload, half of the weight is left."""
 LIGHT_S: Final = 1.0
 """Time for which the legs must be that light, s: a bouncing robot is light for a moment."""
 HEARD_S: Final = 3.0
@@ -56,19 +56,19 @@ PATIENCE_S: Final = 8.0
 """Timeout for a planner that may lead again, s."""
 STALLED_S: Final = 4.0
 STALLED_M: Final = 0.005
-"""If the robot sinks by less than this in that time, something holds it up."""
+"""If the robot sinks by less than `STALLED_M` in `STALLED_S`, something holds it up."""
 SETTLE_S: Final = 40.0
-"""Timeout for DAMP to come to rest, s."""
+"""Timeout for the robot to come to rest in DAMP, s."""
 REST_S: Final = 1.0
 REST_RAD: Final = 0.01
-"""A knee that moves less than this in that time is at rest; rates are too noisy to decide."""
+"""A knee that moves less than this in `REST_S` is at rest; its rate is too noisy to show it."""
 STRAIGHT: Final = -1.0
 """Knee angle, rad; above it a leg with unknown load is straight, not folded."""
 PULLED: Final = 3.0
-"""N m; a straight leg's torques do not show its load. Weight presses a knee back, so a knee carries
-nothing if its own shin pulls it against the stop more strongly than friction can."""
+"""N m. A straight leg's torques do not show its load. But the leg carries nothing if its knee
+torque is below minus this: then the hanging shin, not friction, pulls the knee to its stop."""
 KNEE_CLOSE: Final = 0.08
-"""Distance from the stop within which a knee is down, rad: play and friction keep it there."""
+"""A knee this close to its stop, rad, is down: play and friction keep it from reaching the stop."""
 _KNEES: Final = tuple(MODULE_INDEX[f"knee_{side}"] for side in SIDES)
 _NO_TORQUE: Final = (DriveStatus.IDLE, DriveStatus.ERROR, DriveStatus.UNZEROED)
 _MAY_LEAD: Final = (
@@ -92,7 +92,7 @@ class Ask(Enum):
 class DescentPhase(Enum):
     """Progress of the descent."""
 
-    LOOKING = "checking whether it carries weight"
+    LOOKING = "checking whether the robot bears weight"
     LOWERING = "going down, led by the planner"
     SETTLING = "sinking in DAMP"
     RESTING = "holding at its lowest pose"
@@ -140,7 +140,7 @@ class Descent:
     """Decides at each step what to request."""
 
     def __init__(self, robot: RobotConfig, wait_s: float) -> None:
-        """Begin by checking the load; at rest wait `wait_s` until the weight is taken."""
+        """Begin by checking the load; `wait_s` is the timeout for a hoist or stand to take it."""
         self._load, self._wait_s = _LegLoad(robot), wait_s
         self._stop = robot.joint_service.damp_knee_stop
         self._fade_s = robot.joint_service.damp_fade_s
@@ -162,8 +162,8 @@ class Descent:
     @property
     def _bears(self) -> str:
         if math.isnan(self._fraction):
-            return "weight unknown"
-        return f"the legs carry {100.0 * self._fraction:.0f} % of the torso"
+            return "the load of the legs is unknown"
+        return f"the legs carry {100.0 * self._fraction:.0f} % of the torso's weight"
 
     def step(
         self, now_s: float, states: Sequence[JointState | None], status: PlannerStatus | None
@@ -207,7 +207,7 @@ class Descent:
         silent = [name for name, state in zip(MODULES, states, strict=True) if state is None]
         if silent:
             if self._for_s(now_s) > HEARD_S:
-                raise FleetError(f"{', '.join(silent)}: silent, so it may carry weight: {WAYS}")
+                raise FleetError(f"{', '.join(silent)}: silent; the robot may bear weight; {WAYS}")
             return Ask.NOTHING
         if self._for_s(now_s) < LIGHT_S or self._light_s is not None:
             return Ask.NOTHING
@@ -218,8 +218,8 @@ class Descent:
         ]
         if limp:
             raise FleetError(
-                f"{', '.join(limp)}: the others may carry weight, and going down would tip "
-                f"the robot: {WAYS}"
+                f"{', '.join(limp)}: the other modules may carry weight, and going down would "
+                f"tip the robot; {WAYS}"
             )
         damped = all(state is not None and state.mode == Mode.DAMP for state in states)
         may_lead = status is not None and status.mode in _MAY_LEAD
@@ -239,8 +239,8 @@ class Descent:
                 return Ask.STOP
             why = status.why or name_of(PlannerMode, status.mode)
             raise FleetError(
-                f"the planner does not lead ({why}), so the robot stands where it is; `xrl estop` "
-                f"lets it sink without a planner; or {WAYS}"
+                f"the planner does not lead ({why}), so the robot stands where it is; run "
+                f"`xrl estop`, which lets it sink without a planner; or {WAYS}"
             )
         if len(known) < len(MODULES):
             return Ask.SIT
@@ -252,8 +252,8 @@ class Descent:
             return Ask.STOP
         if now_s - self._moved_s > STALLED_S:
             raise FleetError(
-                f"it is held up at a COM of {height:.2f} m, so it stands where it is: take the "
-                "hand off and run `xrl down` again; if a stand carries it, run `xrl estop`"
+                f"the robot is held up at a COM height of {height:.2f} m, so it stands there; take "
+                "the hand off and run `xrl down` again; if a stand carries it, run `xrl estop`"
             )
         return Ask.SIT
 
@@ -261,21 +261,23 @@ class Descent:
         if any(state.mode not in (Mode.DAMP, Mode.FAULT) for state in known):
             self._moved_s = now_s
             if self._for_s(now_s) > HEARD_S:
-                raise FleetError(f"not all modules go to DAMP: run `xrl status`; {WAYS}")
+                raise FleetError(
+                    f"not all modules go to DAMP; run `xrl status` to see which; {WAYS}"
+                )
             return Ask.STOP
         if len(known) < len(MODULES) or abs(self._knee - self._rested) > REST_RAD:
             self._moved_s, self._rested = now_s, self._knee
         if self._for_s(now_s) > self._fade_s and now_s - self._moved_s > REST_S:
             self._enter(DescentPhase.RESTING, now_s)
         elif self._for_s(now_s) > SETTLE_S:
-            raise FleetError(f"it does not come to rest within {SETTLE_S:g} s; {WAYS}")
+            raise FleetError(f"the robot does not come to rest within {SETTLE_S:g} s; {WAYS}")
         return Ask.NOTHING
 
     def _rest(self, now_s: float) -> Ask:
         if self._for_s(now_s) > self._wait_s:
             raise FleetError(
-                f"down, but the robot still bears weight: {self._bears}; its services continue, "
-                f"and the drives stay armed: {WAYS}"
+                f"down, but the robot may still bear weight: {self._bears}; its services "
+                f"continue, and the drives stay armed; {WAYS}"
             )
         return Ask.NOTHING
 
@@ -287,7 +289,9 @@ UNHEARD_S: Final = 0.5
 TELL_S: Final = 1.0
 WAITING_TELL_S: Final = 5.0
 
-HINT: Final = "; take its weight: hang it, feet in the air, or put a stand under its torso"
+HINT: Final = (
+    "; take the robot's weight: hang it with its feet in the air, or put a stand under its torso"
+)
 
 Tell = Callable[[str], None]
 
@@ -298,27 +302,25 @@ def asker(verb: str) -> str:
 
 
 def other_asker(status: PlannerStatus | None, own: str = "") -> str:
-    """Return another requester of the planner, except a scenario, or an empty string."""
+    """Return the name of another tool whose request the planner follows, or an empty string."""
     by = "" if status is None else status.requested_by
     return "" if by in (SCENARIO, own) else by
 
 
 def lower(robot: RobotConfig, run_dir: Path, tell: Tell, *, wait_s: float, simulated: bool) -> None:
-    """Go down, and wait until the legs carry nothing; return at once if they carry nothing.
+    """Lower the robot, and wait until its legs carry no weight; return at once if it hangs.
 
-    Ctrl-C ends it: until the robot is down it stands where it is. Its weight must be taken within
-    `wait_s`; a simulated robot only needs to be down.
+    After Ctrl-C the robot stands where it is, or continues to sink if it is already in DAMP. Its
+    weight must be taken within `wait_s`; a simulated robot only needs to be down.
 
     Raises:
-        FleetError: it carries weight and cannot go down, or nothing takes its weight.
+        FleetError: the robot bears weight and cannot be lowered, or nothing takes its weight.
     """
     try:
         with open_session(robot, "down", run_dir) as session:
             _Lowering(robot, session, tell, simulated=simulated).run(Descent(robot, wait_s))
     except BusError as error:
-        raise FleetError(
-            f"{error}; so it is unknown whether the robot bears weight: {WAYS}"
-        ) from None
+        raise FleetError(f"{error}; it is unknown whether the robot bears weight; {WAYS}") from None
 
 
 class _Lowering:
@@ -368,11 +370,11 @@ class _Lowering:
                 time.sleep(LOOK_S)
         except KeyboardInterrupt:
             self._tell(
-                "interrupted: its services continue, and "
+                "interrupted: the services continue, and "
                 + (
-                    "it stands where it is"
+                    "the robot stands where it is"
                     if descent.phase in (DescentPhase.LOOKING, DescentPhase.LOWERING)
-                    else "it sinks to its lowest pose in DAMP, where it holds"
+                    else "the robot sinks to its lowest pose in DAMP, where it holds"
                 )
             )
             raise
@@ -385,7 +387,7 @@ class _Lowering:
         if ask in (Ask.SIT, Ask.STOP) and not self._seq:
             require_operator(self._robot, "down")
             if other := other_asker(status, self._source):
-                raise FleetError(f"{other} requests something else from the robot; end that first")
+                raise FleetError(f"{other} requests something else of the robot; end that first")
             # the assist continues during the descent
             self._assist_n = status.assist_requested_n if status is not None else 0.0
         if ask is Ask.STOP:

@@ -24,7 +24,7 @@ class Number(NamedTuple):
     field: str
     """Field of `Inject`."""
     units: Mapping[str, str]
-    """Unit after a number, and the factor to SI."""
+    """Units that may follow the number, each with its factor to the field's unit."""
     like: str
     """Hint with valid values."""
 

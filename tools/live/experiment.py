@@ -43,13 +43,13 @@ from tools.output import make_folder
 from tools.terminal import Console, marked
 
 PLANT_FILE = "plant.toml"
-"""Name of the plant among a run's results and in its log."""
+"""Name of the plant's file among a run's results and in its log."""
 
 FAILED_START: Final = "failed-start.mcap"
 """Name of the record of the newest start that failed."""
 
 UNJUDGED = ("simulator", "recorder")
-"""A run cannot be judged without these services."""
+"""Services without which a run cannot be judged."""
 
 _NUMBER = r"\d+(?:\.\d*)?"
 
@@ -66,27 +66,27 @@ class PlantFlags(Flags):
         tuple[str, ...],
         Arg(
             metavar="NAME|FILE|KEY=VALUE",
-            help=f"the true robot: {', '.join(NAMED)} (default: realistic), a TOML file, or one "
-            "value such as drivetrain.stiffness=5000 or floor.slope=[0.03,0.0]; may be repeated, "
-            "each overrides those before; no controller sees it (deploy/plants/README.md)",
+            help="differences of the simulated robot from its robot file: "
+            f"{', '.join(NAMED)} (default: realistic), a TOML file, or one value, such as "
+            "floor.slope=[0.03,0.0]; repeatable: a name or file replaces earlier words "
+            "(deploy/plants/README.md)",
         ),
     ] = ()
 
 
 class ControllerFlags(Flags):
-    """The user's own controller instead of the law."""
+    """A controller that replaces the law."""
 
     controller: Annotated[str | None, Arg(metavar="FILE.py[:NAME]")] = None
-    """your own controller instead of the law, behind the same certificate, age rule and limits
-    (docs/own-controller.md, examples/lqr_controller.py)"""
+    """your own controller in place of the law; certificate, age rule and limits stay
+    (docs/own-controller.md)"""
 
 
 class ImuFlags(Flags):
     """An IMU, regardless of the robot file."""
 
     imu: bool = False
-    """add an IMU on the torso and its service: the robot then stands on slopes (imu.fitted of the
-    robot file)"""
+    """add an IMU and its service, so that the robot stands on slopes (sets imu.fitted)"""
 
 
 def _refused(text: str, form: str, **known: Iterable[str]) -> argparse.ArgumentTypeError:
@@ -140,21 +140,21 @@ def parse_fault(text: str) -> Fault:
 
 
 class LawFlags(ConfigFlags, ImuFlags):
-    """A robot whose law is changed for one run."""
+    """Changes to the robot's law for one run."""
 
     split: Annotated[str | None, Arg(choices=choices("split"))] = None
-    """gain split of the law"""
+    """local gains: the certified schedule, or the paper's diag(K_q) (default: law.split)"""
     jacobian: Annotated[str | None, Arg(choices=choices("jacobian"))] = None
-    """load sharing of the legs; average implies the diagonal split, because no gains certify
-    it"""
+    """load sharing of the legs (default: law.jacobian); average has no certified gains, so it
+    implies --split diagonal"""
 
 
 class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
     """The flags of an experiment."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
-    """scenario: a name (of a file in scenarios/ beside the robot file, or of a shipped one), or a
-    file (default: squat, the paper's Fig. 7)"""
+    """file, or name of a scenario, shipped or in scenarios/ beside the robot file (default: squat,
+    the paper's Fig. 7)"""
     duration: Duration | None = None
     """scenario time to run, s"""
     kill: Annotated[
@@ -163,43 +163,42 @@ class ExperimentFlags(LawFlags, PlantFlags, ControllerFlags):
             _parse_kill,
             "SERVICE@T[:SIGNAL]",
             help=f"send a signal ({', '.join(SIGNALS)}; default KILL) at scenario time T; "
-            "replaces the scenario's kills; may be repeated",
+            "replaces the scenario's kills and restarts; repeatable",
         ),
     ] = None
     restart: Annotated[tuple[Restart, ...] | None, parsed(_parse_restart, "SERVICE@T")] = None
-    """start a killed service again, or continue a stopped one; may be repeated"""
+    """restart a killed service, or continue a stopped one, at scenario time T; replaces the
+    scenario's restarts; repeatable"""
     push: Annotated[tuple[Push, ...] | None, parsed(_parse_push, "T:DUR:FX,FY,FZ")] = None
-    """push the torso by a force in N from T for DUR s; replaces the scenario's pushes; may be
-    repeated"""
+    """push the torso with a force, N, from T for DUR s; replaces the scenario's pushes;
+    repeatable"""
     fault: Annotated[
         tuple[Fault, ...] | None,
         parsed(
             parse_fault,
             "MODULE:KIND@T",
-            help=f"a fault of a module's drive ({', '.join(FAULT_KINDS)}) at scenario time T; "
-            "MODULE.1 is its second axis, @T:DUR lasts DUR s; replaces the scenario's faults; "
-            "may be repeated",
+            help="fail a module's drive at scenario time T, with a KIND from `xrl faults`; "
+            "MODULE.1 selects the second axis, @T:DUR a duration, s; replaces the scenario's "
+            "faults; repeatable",
         ),
     ] = None
     inject: Annotated[tuple[Inject, ...] | None, parsed(parse_inject, "'LINK KEY=VALUE ...'")] = (
         None
     )
-    """impair a link, such as 'planner->joints delay=30 jitter=10 at=3 for=4' (ms
-    and s), 'all loss=20% burst=5', 'planner->left partition at=3'; at is scenario time; `xrl inject
-    --help` explains each word, and which of several applies; replaces the scenario's impairments;
-    may be repeated"""
+    """impair a link as `xrl inject` does, but with at in scenario time, such as 'planner->joints
+    delay=30 jitter=10 at=3 for=4'; replaces the scenario's impairments; repeatable"""
     seed: Natural = 0
-    """seed of the sensors' noise and of the network's losses and delays"""
+    """seed of sensor noise, network losses and delays"""
 
 
 ROW_FIELDS: Final = ("kill", "restart", "push", "fault", "inject")
-"""Rows of a scenario that flags with the same name set."""
+"""Rows of a scenario that the flags of the same names replace."""
 SHOWN: Final = 12
 """Maximum number of actions in the first line of a run."""
 
 
 def scenario_file(name: str, config: Path = DEFAULT_CONFIG) -> Path:
-    """Return the file of a scenario, absolute: a path to a .toml file, or a name.
+    """Return the absolute path of a scenario's file; `name` is a path to a .toml file, or a name.
 
     A name stands for a file in `scenarios` beside the robot file, or else for a shipped one.
     """
@@ -235,9 +234,9 @@ def make_scenario(flags: ExperimentFlags) -> Scenario:
 
 
 def describe(scenario: Scenario) -> str:
-    """Return the actions on the run as a clause for its first line."""
+    """Return the scenario's actions as a clause for the first line of a run."""
     done = [f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill]
-    done += [f"{row.service} back at {row.at:g} s" for row in scenario.restart]
+    done += [f"{row.service} restarted at {row.at:g} s" for row in scenario.restart]
     done += [f"{row.module} {row.kind} at {row.at:g} s" for row in scenario.fault]
     done += [in_words_of(row) for row in scenario.inject]
     done += ["push {:g},{:g},{:g} N at {:g} s".format(*row.force, row.at) for row in scenario.push]
@@ -276,7 +275,7 @@ def make_out(out: Path | None, verb: str) -> Path:
     """Make the directory of a run's results; the default name has the verb and the time."""
     out = make_folder(out, verb)
     if (out / FIRST).exists():
-        raise RunError(f"{out}: already contains a run; choose another --out, or remove it")
+        raise RunError(f"{out}: already contains a run; choose another --out, or remove the run")
     return out
 
 

@@ -40,7 +40,7 @@ def run_live(
 ) -> T:
     """Start a fleet, call `lead`, stop the fleet; return what `lead` returns.
 
-    In every case, no process and no run directory is left, and the logs are in `out`.
+    Even after a failure, no process and no run directory remains, and the logs are in `out`.
 
     Args:
         out: folder for the run's log, its inputs and the services' logs.
@@ -48,12 +48,12 @@ def run_live(
         scenario: motion of the simulated operator and faults of the drives; `lead` does the kills.
         lead: leads the run; receives the fleet and a session on its bus.
         verb: verb on the command line; names the run directory and the session.
-        seed: seed of the sensors' noise.
+        seed: seed of sensor noise, network losses and delays.
         true_plant: the simulated robot's differences from `robot`.
         no_restart: services that the supervisor does not restart when they end.
         pace: clock rate of the fleet. None: the default, lowered step by step while the cores are
             full; the pace found becomes the default of this process.
-        controller: the user's own, `FILE.py[:NAME]`, instead of the law.
+        controller: the user's controller, `FILE.py[:NAME]`; None: the law.
         tell: receives a line of text each time the pace is lowered.
     """
     out = out.absolute()
@@ -71,7 +71,7 @@ def run_live(
 
     def again(text: str) -> None:
         for record in out.glob("run*.mcap"):
-            record.unlink()  # of a robot that only stood and waited
+            record.unlink()  # it shows only a robot that waited
         tell(text)
 
     return once(pace) if pace is not None else run_at_fitting_pace(once, again)

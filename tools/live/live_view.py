@@ -79,7 +79,7 @@ def active(injects: Sequence[Inject], scenario_s: float) -> str:
 
 
 def said_by(planner: PlannerStatus | None) -> tuple[str, str]:
-    """Return what a person must know, and when a planner that waits after dropouts leads again."""
+    """Return why the planner does not lead, and when it leads again after dropouts, as text."""
     if planner is None:
         return "", ""
     why = printable(reason_of(planner))

@@ -1,7 +1,7 @@
 """Leads a live run through its scenario: start, kills, restarts, end.
 
-It watches the simulated truth on the bus and acts by scenario time. Each action is published as a
-run event, so the log alone shows all of them.
+It receives the simulated truth from the bus and acts by scenario time. Each action is published as
+a run event, so the log shows all of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from shared.bus.messages import (
     SimControl,
     name_of,
 )
-from shared.bus.session import Latest, Session
+from shared.bus.pubsub import Latest
+from shared.bus.session import Session
 from shared.bus.traces import SimTruth
 from shared.clock import NS_PER_S, machine_s, now_ns, pace
 from shared.config.scenarios import Fault, Inject, Kill, Push, Restart, Scenario
@@ -37,16 +38,17 @@ from tools.fleet.stalls import Stall, StallWatch
 from tools.fleet.supervise import SupervisedFleet
 
 READY_TIMEOUT_S: Final = 45.0
-"""Longer than a planner's waits after its first five dropouts, s: the machine may stall."""
+"""Timeout for all modules to track, s: longer than a planner waits after five dropouts, because the
+machine may stall."""
 PATIENCE_S: Final = 10.0
-"""Start-up uses all cores. A robot that does not stand after this time, s, gets as much again, in
-which the idle fraction is measured."""
+"""Time for the start, which uses all cores, s. If the robot does not stand by then, the idle
+fraction is measured over the same time again."""
 SETTLE_S: Final = 2.0
 """Time for which all six modules must track before the scenario starts, s."""
 AFTER_FALL_S: Final = 1.0
 """Time from a fall to the end of the run, s."""
 SILENT_S: Final = 3.0
-"""Timeout for the simulated world, s; then the run is over."""
+"""Timeout for the simulator's messages, s; after it the run ends with an error."""
 LAST_WORDS_S: Final = 0.3
 """Time in which the last messages reach the recorder, s."""
 POLL_S: Final = 0.004
@@ -55,7 +57,7 @@ UNHEARD_S: Final = 0.5
 PIDS_EVERY_S: Final = 1.0
 STARTING: Final = "waiting for six modules to track"
 FULL_CORE: Final = 0.2
-"""With less idle time beside the fleet, one core of two may be full; of four cores, none is."""
+"""Idle fraction below which one of two cores may be full."""
 ENDING_S: Final = 3.0
 """Timeout for a service to end after TERM or INT, s; by then it has ended or was killed."""
 
@@ -65,12 +67,12 @@ class LiveSnapshot(NamedTuple):
 
     truth: SimTruth | None
     modes: tuple[str, ...]
-    """One letter per module: D, H, T, damp, FAULT; `-` for a silent module."""
+    """First letter of each module's mode; `-` for a silent module."""
     note: str
 
 
 class EndOfRun(NamedTuple):
-    """The end of a run."""
+    """Result of a run."""
 
     cpu_pct: float | None
     """CPU use of all processes together, %: 100 is one core; None if the robot fell before the
@@ -80,7 +82,7 @@ class EndOfRun(NamedTuple):
 
 
 class TriggeredKill(NamedTuple):
-    """A kill without a fixed time: when modules track again after a dropout."""
+    """A kill without a fixed time: it comes when modules track again after a dropout."""
 
     service: str
     modules: int
@@ -184,7 +186,7 @@ class ScenarioRunner:
         self._armed = _ArmedKill(triggered_kill)
         self._events = _RunEvents(session)
         self._truths: Latest[SimTruth] = session.latest(topics.SIM_TRUTH, SimTruth)
-        # a triggered kill follows the modes closely; a batch is up to 20 ms old
+        # a triggered kill needs the newest modes; a batch is up to 20 ms old
         subscribe = session.latest_in_batch if triggered_kill is None else session.latest
         self._states = {m: subscribe(topics.JOINT_STATE, JointState, m) for m in MODULES}
         self._planner: Latest[PlannerStatus] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
@@ -200,11 +202,11 @@ class ScenarioRunner:
         self._killed = False
 
     def run(self, is_over: Callable[[], bool] = lambda: False) -> EndOfRun:
-        """Wait until the robot stands, run the scenario to its end, or until `is_over`.
+        """Wait until the robot stands; then run the scenario to its end, or until `is_over`.
 
         Raises:
             CoresFullError: the cores are too slow for the fleet at its pace.
-            RunError: the robot did not get to stand, or the simulated world fell silent.
+            RunError: the robot did not stand in time, or the simulator restarted or fell silent.
             FleetError: a service could not be restarted.
         """
         with self._stalls:
@@ -232,9 +234,9 @@ class ScenarioRunner:
             self._sample_processes(meter)
             truth = self._truth
             if truth is not None and truth.scenario_s < 0.0:
-                raise RunError("the simulator has restarted, and its scenario is lost")
+                raise RunError("the simulator has restarted, and its scenario is lost; see its log")
             if truth is not None:
-                # between two truths the scenario's clock advances with this process's clock
+                # between two such messages the scenario's clock advances with this process's clock
                 self._events.start_ns = _zero_ns(truth)
                 if truth.fallen and truth.scenario_s < fallen_at_s:
                     fallen_at_s, self._note = truth.scenario_s, "FALLEN"
@@ -257,7 +259,7 @@ class ScenarioRunner:
         time.sleep(LAST_WORDS_S)
 
     def _sample_processes(self, meter: _CpuMeter) -> None:
-        """Read the processes once a second, so that a kill need not ask the supervisor."""
+        """Read the process ids once a second, so that a kill needs no call to the supervisor."""
         now_s = time.monotonic()
         if now_s >= self._next_pids_s:
             self._next_pids_s = now_s + PIDS_EVERY_S
@@ -267,7 +269,7 @@ class ScenarioRunner:
     def _wait_until_tracking(self, is_over: Callable[[], bool]) -> bool:
         """Wait until the hoist is down and all six modules have tracked for `SETTLE_S`.
 
-        While they track, the idle fraction of the cores decides whether they suffice.
+        Meanwhile the idle fraction of the cores shows whether the cores suffice.
         Return False if the robot falls first, which is a result and not an error.
         """
         begin_s = time.monotonic()
@@ -313,7 +315,7 @@ class ScenarioRunner:
             half = max(PACE_MIN, pace() / 2)
             remedy = f"add `--pace {half:g}`" if half < pace() else "end other programs"
             raise CoresFullError(
-                f"the cores are too slow for the fleet at {pace():g} of real time: "
+                f"the cores are too slow for the fleet at a pace of {pace():g}: "
                 f"{100 * idle:.0f} % idle; modules: {self._describe_modes()}; {remedy}"
             )
 
@@ -324,7 +326,7 @@ class ScenarioRunner:
         )
 
     def _start(self) -> None:
-        """Request the start from the world until it has started."""
+        """Request the start from the simulator until the scenario has started."""
         asked, deadline = 0, time.monotonic() + 5.0
         while self._truth is None or self._truth.scenario_s < 0.0:
             asked += 1
@@ -372,7 +374,7 @@ class ScenarioRunner:
         return f"{stalls.longest.words}{by_it}"
 
     def _act(self, row: Kill | Restart | Push | Fault | Inject) -> None:
-        """Do an action that is due; the simulator does pushes and faults, this records them."""
+        """Carry out a due action; the simulator does pushes and faults, which are only recorded."""
         if isinstance(row, Kill):
             self._events.say(RunEventKind.KILLED, row.service, row.signal)
             self._killed = True
@@ -380,7 +382,7 @@ class ScenarioRunner:
             try:
                 os.kill(self._pids[row.service], number)
             except (KeyError, ProcessLookupError):
-                words = f"kill {row.service}@{row.at:g}: it has no process at that time"
+                words = f"kill {row.service}@{row.at:g}: the service has no process at that time"
                 raise RunError(f"{words}; see logs/{row.service}.log") from None
             self._note = f"{row.service} {'stopped' if row.signal == 'STOP' else 'killed'}"
         elif isinstance(row, Restart):

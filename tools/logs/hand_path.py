@@ -13,7 +13,7 @@ from shared.clock import NS_PER_S
 from tools.logs.run_log import NewestAt, RunLog
 
 EARLY_NS: Final = 1000
-"""Margin, ns: scenario time in lockstep is a sum of steps, so it may be a rounding error early."""
+"""Margin, ns: scenario time in lockstep is a sum of steps and may be early by rounding errors."""
 
 
 class HandRow(msgspec.Struct, frozen=True):
@@ -26,7 +26,7 @@ class HandRow(msgspec.Struct, frozen=True):
 def hand_path(log: RunLog) -> tuple[HandRow, ...]:
     """Return the motion of the hand during the scenario, in order; empty if nobody led it.
 
-    The first row is the hand's last position before the scenario, where it stayed.
+    The first row is the hand's last position before the scenario.
     """
     led: list[HandLead] = log.messages(topics.OPERATOR_HAND)
     truths: list[SimTruth] = log.messages(topics.SIM_TRUTH) if led else []
@@ -41,7 +41,7 @@ def hand_path(log: RunLog) -> tuple[HandRow, ...]:
         rows.append(HandRow(0.0, msgspec.structs.replace(before[-1], push=(0.0, 0.0, 0.0))))
     for hand in led:
         if hand.t_ns >= begin_ns:
-            # by the newest truth, because a late simulator skips time
+            # relative to the newest truth, because a late simulator skips time
             truth = newest.at(hand.t_ns) or truths[0]
             after_ns = hand.t_ns - truth.t_ns - EARLY_NS
             rows.append(HandRow(max(0.0, truth.scenario_s + after_ns / NS_PER_S), hand))

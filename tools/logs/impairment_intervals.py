@@ -20,7 +20,7 @@ class Impaired(NamedTuple):
     link: str
     """A direction or a group of directions, as requested."""
     words: str
-    """The impairment, in the words of `--inject`."""
+    """The impairment, in the format of `--inject`."""
     directions: frozenset[str]
     """Directions, as named in `shared.links`."""
     begin_ns: int
@@ -42,7 +42,7 @@ class Impaired(NamedTuple):
         return (self.begin_ns - zero_ns) / NS_PER_S
 
     def end_s(self, zero_ns: int) -> float | None:
-        """Return its end, s after a stamp, or None if that is not in the log."""
+        """Return its end, s after a stamp, or None if the log does not contain it."""
         return None if self.end_ns is None else (self.end_ns - zero_ns) / NS_PER_S
 
     def at(self, t_ns: int) -> bool:
@@ -64,8 +64,8 @@ class Impaired(NamedTuple):
 def impairments(events: Iterable[LinkEvent]) -> list[Impaired]:
     """Return all impairments in the order of their start.
 
-    A killed network proxy records no end, and its successor counts from 1 again. So a number that
-    begins again ends the earlier impairment with that number.
+    A killed network proxy records no end, and its successor counts from 1 again. So an impairment
+    ends at the latest when another one with the same number starts.
     """
     found: list[list[LinkEvent]] = []
     ends: list[list[LinkEvent]] = []

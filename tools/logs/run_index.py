@@ -1,8 +1,8 @@
-"""Index of a run's files: their content and its places, without messages; the files of one run.
+"""Index of a run's files: metadata, attachments, and the places of the messages.
 
-A record of an hour has 2 GiB and, if read whole, takes ten times that in memory. So its files are
-skimmed once, and `tools/logs/run_log.py` reads only the needed parts. A split run consists of
-several files in one directory.
+A record of one hour has 2 GiB, and would take ten times that in memory. So its files are skimmed
+once, and `tools/logs/run_log.py` reads only the needed parts. A split run consists of several files
+in one directory.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shared.mcap_log.writer import SCHEMA_VERSION
 from shared.toml_file import decoded
 
 THIS_HOST: Final = "this host"
-"""Name of the host of services whose endpoint is a socket in the file system."""
+"""Host name of services whose endpoint is a socket in the file system."""
 _HOST: Final = re.compile(r"(?:tls|tcp)/(\[[^\]]+\]|[^:]+):")
 _OFFSET: Final = re.compile(r"-?[0-9]{1,20}")
 _EVER: Final = 1 << 64
@@ -48,7 +48,7 @@ def head_of(path: Path) -> MetadataByName:
 
 
 def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
-    """Return the files of the run that a file belongs to, in order; at least that file.
+    """Return the files of the run to which a file belongs, in order, including that file.
 
     A recovered copy is used only if the original is missing.
     """
@@ -68,11 +68,13 @@ def files_of_run(path: Path, metadata: MetadataByName) -> list[Path]:
 
 
 def files_in(directory: Path) -> list[Path]:
-    """Return the files of the only run in a directory, in order."""
+    """Return the files of the run in a directory, in order; raise RunError for several runs."""
     runs = _runs_in(directory)
     if len(runs) > 1:
         first = ", ".join(run[0].name for run in runs)
-        raise RunError(f"{directory}: contains {len(runs)} runs ({first}); give the files of one")
+        raise RunError(
+            f"{directory}: contains {len(runs)} runs ({first}); give the files of one run"
+        )
     return runs[0]
 
 
@@ -109,13 +111,13 @@ class _RecordedFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.metadata: MetadataByName = {}
-        """Metadata records by name: `run`, `clock`, `packages`, at the end `counts`."""
+        """Metadata records by name: `run`, `clock`, `packages`, and at the end `counts`."""
         self.attachments: dict[str, bytes] = {}
         self.keys: dict[int, str] = {}
         """Full key of each channel."""
         self.chunks: list[ChunkPlace] = []
         self.damage: list[LostBytes] = []
-        """Unreadable places in what has been read."""
+        """Unreadable places found so far."""
         with open_log(path) as reader:
             for found in reader.skim():
                 if isinstance(found, ChunkPlace):
@@ -140,7 +142,7 @@ class _RecordedFile:
 
     @property
     def offset_ns(self) -> int:
-        """Offset of the wall clock in ns since 1970 from the `t_ns` of a message."""
+        """Wall clock, ns since 1970, minus the `t_ns` of a message."""
         text = self.required("clock", "offset_ns")
         if not _OFFSET.fullmatch(text):
             raise RunError(f"{self.path}: clock.offset_ns is {text[:40]!r}; must be an integer")
@@ -182,7 +184,7 @@ class _RecordedFile:
             self.damage += [loss for loss in reader.damage if loss not in self.damage]
 
     def _among(self, begin_ns: int, end_ns: int, keys: frozenset[str] | None) -> list[ChunkPlace]:
-        """Return the chunks to read, always with the first, because it repeats the channels."""
+        """Return the chunks to read, including the first, because it repeats the channels."""
         others = {n for n, key in self.keys.items() if keys is not None and key not in keys}
         return [
             chunk
@@ -223,7 +225,7 @@ class RunIndex:
             )
         self.robot = first.required("run", "robot")
         self.offset_ns = first.offset_ns
-        """Offset of the wall clock in ns since 1970 from the `t_ns` of a message."""
+        """Wall clock, ns since 1970, minus the `t_ns` of a message."""
         spans = [file.span_ns for file in self._files if file.span_ns is not None]
         self.began_ns = min((begin for begin, _ in spans), default=self.offset_ns)
         """Log time of the first message."""
@@ -242,7 +244,7 @@ class RunIndex:
 
     @property
     def metadata(self) -> MetadataByName:
-        """Metadata records by name: `run`, `clock`, `packages`, at the end `counts`."""
+        """Metadata records by name: `run`, `clock`, `packages`, and at the end `counts`."""
         return dict(chain.from_iterable(file.metadata.items() for file in self._files))
 
     @property
@@ -256,7 +258,7 @@ class RunIndex:
 
     @property
     def hosts(self) -> dict[str, str]:
-        """Host of each service, by the attached robot file; empty if it does not name hosts."""
+        """Host of each service in the attached robot file; empty if the file names no hosts."""
         text = self.attachments.get("robot.toml", b"")
         try:
             endpoints = tomllib.loads(decoded(text)).get("bus", {}).get("endpoints", {}).items()
@@ -270,7 +272,7 @@ class RunIndex:
 
     @property
     def recorded_beside(self) -> str:
-        """A service on the host of this record's recorder; each host may have a recorder."""
+        """Name of a service on the host of this record; each host may have a recorder."""
         return self.metadata["run"].get("of", "").partition(",")[0] or RECORDER
 
     @property
@@ -280,18 +282,18 @@ class RunIndex:
 
     @property
     def damage(self) -> list[LostBytes]:
-        """Unreadable places in what has been read; they are left out."""
+        """Unreadable places found so far; their messages are left out."""
         return [loss for file in self._files for loss in file.damage]
 
     @property
     def cut(self) -> LostBytes | None:
-        """Rest after the last whole record of a file that was cut off."""
+        """Bytes after the last whole record of a file that was cut off, or None."""
         return next((file.cut for file in reversed(self._files) if file.cut is not None), None)
 
     def records(
         self, begin_ns: int, end_ns: int, keys: frozenset[str] | None = None
     ) -> Iterator[tuple[LogRecord, dict[int, str]]]:
-        """Yield such chunks of all files, each with the full keys of its channels."""
+        """Yield the chunks of `_RecordedFile.records`, each with the full keys of its channels."""
         for file in self._files:
             for record in file.records(begin_ns, end_ns, keys):
                 yield record, file.keys

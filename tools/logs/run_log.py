@@ -1,11 +1,12 @@
-"""Reads a run's messages from its files, finished or killed: the whole run, or a part of its time.
+"""Read a run's messages from its files, finished or not: the whole run, or a part of its time.
 
-A killed file has no summary, and may end inside a record. The readers of the mcap package find
-nothing without a summary, and may fail at a cut record (docs/logs.md). `shared.mcap_log.reader`
-walks the records from the start and keeps every whole one; this module sorts them by key.
+The file of a killed recorder has no summary, and may end inside a record. The readers of the mcap
+package find nothing without a summary, and may fail at a truncated record (docs/logs.md).
+`shared.mcap_log.reader` reads every complete record from the start; this module sorts the messages
+by key.
 
-A whole run takes about 3 MB of memory per second, and ten with decoded messages. `parts_of`
-reads a long run part by part.
+A run takes about 3 MB of memory per second, and 10 MB with decoded messages. `parts_of` reads a
+long run part by part.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ from tools.topic_keys import sender_of
 PART_S: Final = 30.0
 """Length of a part, s: its decoded messages take about 0.4 GB."""
 MARGIN_S: Final = 1.0
-"""Time before and after a part that is read too, s: a tick's inputs and outputs."""
+"""Time before and after a part that is also read, s, for the inputs and outputs of its ticks."""
 WHOLE_MAX_S: Final = 600.0
-"""Longest time that is read at once, s."""
+"""Maximum time that is read at once, s."""
 PICTURE_MAX_S: Final = 120.0
-"""Longest time in one picture of a run, s."""
+"""Maximum time in one picture of a run, s."""
 RESTART_NS: Final = 60 * NS_PER_S
-"""A clock that jumps by more than this has restarted with its host; no link delays that long."""
+"""A clock that jumps by more than this has restarted with its host; no link causes such a delay."""
 ONE_CLOCK_NS: Final = 100 * NS_PER_MS
 """Clocks with a smaller offset are the same clock: two hosts never start that simultaneously."""
 
@@ -52,7 +53,7 @@ SEE_INFO: Final = "`xrl log info` shows the content of the file"
 
 
 class RunPart(NamedTuple):
-    """A part of a run's time, s since its first message."""
+    """A time range of a run, s since its first message."""
 
     begin_s: float = 0.0
     end_s: float = math.inf
@@ -61,7 +62,7 @@ class RunPart(NamedTuple):
 _EVER: Final = 1 << 62
 WHOLE: Final = RunPart()
 NOTHING: Final = RunPart(0.0, 0.0)
-"""Only events."""
+"""Part with only the topics of events."""
 
 
 class Series:
@@ -70,7 +71,7 @@ class Series:
     def __init__(self) -> None:
         self.payloads: list[bytes] = []
         self.received_ns: list[int] = []
-        """Reception by the recorder, on the monotonic clock."""
+        """Times of reception by the recorder, on the monotonic clock."""
         self.seq: list[int] = []
         self.decoded: list[Any] | None = None
 
@@ -99,11 +100,11 @@ class RunLog:
     """The messages of a run, or of a part of it, in memory.
 
     Messages are decoded on request, once per key. Topics of events, which have no rate, are always
-    read for the whole run, since a mode or a cut link from before a part is still active in it.
+    read for the whole run, because a mode or a cut link from before a part still applies in it.
 
-    Where services ran on several hosts, `t_ns` of messages from other hosts than the recorder's is
+    If services ran on several hosts, `t_ns` of messages from other hosts than the recorder's is
     converted to the recorder's clock (`_on_recorders_clock`), so that times are comparable. With
-    `as_sent` it is not converted, as re-execution needs. Other times in a message remain on its
+    `as_sent`, for re-execution, it is not converted. Other times in a message remain on its
     sender's clock.
     """
 
@@ -122,7 +123,7 @@ class RunLog:
         began_ns, ended_ns = index.span_ns
         self.begin_ns = began_ns + _ns(part.begin_s)
         self.end_ns = min(began_ns + _ns(part.end_s), ended_ns + 1)
-        """The part on the monotonic clock: from `begin_ns`, before `end_ns`."""
+        """End of the part on the monotonic clock, exclusive; the part begins at `begin_ns`."""
         self.is_first = part.begin_s <= 0.0
         self.is_last = self.end_ns > ended_ns
         self.is_whole = self.is_first and self.is_last
@@ -165,11 +166,11 @@ class RunLog:
         return series.decoded
 
     def newest(self, topic: Topic, module: str = "") -> NewestAt:
-        """Return the finder of the newest of `messages(topic, module)` at a time."""
+        """Return a `NewestAt` over `messages(topic, module)`."""
         return NewestAt(self.messages(topic, module))
 
     def raw(self, key: str) -> list[tuple[int, bytes, int]]:
-        """Return (monotonic reception, payload, sequence number) of every message of a key."""
+        """Return (monotonic time of reception, payload, sequence number) of a key's messages."""
         series = self._of(key)
         return list(zip(series.received_ns, series.payloads, series.seq, strict=True))
 
@@ -180,7 +181,7 @@ class RunLog:
     def received_ns(self, topic: Topic, module: str = "") -> list[int]:
         """Return the time at which the recorder received each of `messages(topic, module)`.
 
-        Monotonic clock of the recorder's host, as for `t_ns` of senders on that host.
+        The times are on the monotonic clock of the recorder's host.
         """
         return self._of(self._key(topic, module)).received_ns
 
@@ -191,7 +192,7 @@ class RunLog:
         )
 
     def count_into(self, counts: dict[str, KeyCount]) -> None:
-        """Add the counts of this part, without its margins, to those of the parts before."""
+        """Add the counts of this part, without its margins, to `counts` of the earlier parts."""
         for key in self.keys():
             count = counts.setdefault(key, KeyCount(several=topics.several_may_write(key)))
             for t_ns, _, seq in self.raw(key):
@@ -199,7 +200,7 @@ class RunLog:
                     count.feed(seq)
 
     def gaps(self) -> dict[str, KeyCount]:
-        """Return counts, gaps and restarts of every key with messages, from the file alone."""
+        """Return counts, gaps and restarts of every key with messages."""
         found: dict[str, KeyCount] = {}
         self.count_into(found)
         return found
@@ -256,7 +257,6 @@ class RunLog:
         *,
         others: bool = True,
     ) -> None:
-        """Sort the messages in a time range by key."""
         offset_ns = self.offset_ns
         first_ns, last_ns = first_ns + offset_ns, last_ns + offset_ns
         for record, keys_by_channel in self.index.records(
@@ -279,11 +279,11 @@ class RunLog:
 def _on_recorders_clock(sent_ns: Sequence[int], received_ns: Sequence[int]) -> list[int]:
     """Return the times of one sender's messages on the clock of the recorder that received them.
 
-    A monotonic clock counts from its host's start, so those of two hosts differ by hours. The
-    fastest message is assumed to have no delay. So times are late by its delay, up to a few
-    milliseconds, and by the drift of the clocks in the part that is read (50 ppm are 1.5 ms in
-    30 s; for topics of events it is the whole run). A host that restarts has another clock from
-    then on. Messages that were delayed by a cut link keep their times.
+    A monotonic clock counts from its host's start, so the clocks of two hosts may differ by hours.
+    The fastest message is assumed to have no delay. So the returned times are late by its delay, up
+    to a few milliseconds, and by the drift of the clocks over the part that is read (1.5 ms in 30 s
+    at 50 ppm; topics of events are read over the whole run). A host that restarts has another clock
+    from then on. Messages that were delayed by a cut link keep their times.
     """
     late_ns = [got - sent for sent, got in zip(sent_ns, received_ns, strict=True)]
     restarts = [n for n, (a, b) in enumerate(pairwise(late_ns), 1) if abs(b - a) > RESTART_NS]
@@ -313,14 +313,14 @@ def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLo
     read_s = min(part.end_s, length_s) - max(part.begin_s, 0.0)
     if read_s > WHOLE_MAX_S:
         raise RunError(
-            f"{index.path}: {read_s:.0f} s exceed the {WHOLE_MAX_S:g} s that can be read at once; "
+            f"{index.path}: {read_s:.0f} s exceeds the {WHOLE_MAX_S:g} s that can be read at once; "
             "choose a part with --from and --to"
         )
     return RunLog(index, part, as_sent=as_sent)
 
 
 def divided(index: RunIndex, part: RunPart, longest_s: float, multiple: int = 1) -> list[RunPart]:
-    """Divide a part of a run into equal pieces; if several, their number is a multiple."""
+    """Divide a part of a run into equal pieces: one, or a multiple of `multiple`."""
     begin_s, end_s = max(part.begin_s, 0.0), min(part.end_s, index.length_s)
     count = max(1, math.ceil((end_s - begin_s) / longest_s))
     count = multiple * math.ceil(count / multiple) if count > 1 else 1
@@ -340,8 +340,8 @@ def parts_of(
 ) -> Iterator[RunLog]:
     """Yield a run, or a part of it, in consecutive parts with only one in memory at a time.
 
-    Each part drops its messages when the next is requested; `margin_s` before and after is read
-    too. `done` receives the time of the run that has been read, s.
+    Each part drops its messages when the next is requested; `margin_s` before and after is also
+    read. `done` receives the time of the run that has been read, s.
     """
     for piece in divided(index, part, part_s):
         log = RunLog(index, piece, margin_s, as_sent=as_sent)
@@ -351,7 +351,7 @@ def parts_of(
 
 
 def robot_of(log: RunLog | RunIndex) -> RobotConfig:
-    """Return the robot with which a log was made."""
+    """Return the robot of a log."""
     raw = text_of(log, "robot.toml")
     robot = config_file.parse(raw, f"{log.path}: robot.toml")
     if "robot.wearer.toml" in log.attachments:
@@ -372,22 +372,22 @@ def text_of(log: RunLog | RunIndex, name: str) -> str:
     try:
         return decoded(log.attachments[name])
     except KeyError:
-        raise RunError(f"{log.path}: has no {name}, as a run of this project does") from None
+        raise RunError(f"{log.path}: has no {name}; must be a run of this project") from None
     except UnicodeError as error:
-        raise RunError(f"{log.path}: {name} in it {error}") from None
+        raise RunError(f"{log.path}: its {name} {error}") from None
 
 
 def has_own_controller(log: RunLog | RunIndex) -> bool:
-    """Return True if a user's own controller led instead of the law."""
+    """Return True if a user's own controller ran instead of the law."""
     return ATTACHED in log.attachments
 
 
 def refuse_own_controller(log: RunLog | RunIndex) -> None:
-    """Refuse a log whose planner was led by a user's own controller."""
+    """Refuse a log whose planner ran a user's own controller."""
     if has_own_controller(log):
         raise RunError(
-            f"{log.path}: a controller of your own led ({ATTACHED} in it), but this command "
-            "computes the shipped law; `xrl log resim --controller FILE` executes it again"
+            f"{log.path}: your own controller ran ({ATTACHED} is attached), but this command "
+            "computes the shipped law; use `xrl log resim --controller FILE`"
         )
 
 

@@ -20,15 +20,15 @@ STICKS: Final = {"lefty": "left stick", "righty": "right stick"}
 TRIGGERS: Final = {"lefttrigger": "left trigger", "righttrigger": "right trigger"}
 """SDL's names of the axes, and the names for messages."""
 BUTTONS: Final = ("a", "b", "x", "y", "leftshoulder", "rightshoulder", "back", "start")
-"""By position, as on an Xbox pad: `a` is below, `b` right, `x` left, `y` above."""
+"""Named by position, as on an Xbox pad: `a` is the lower button, `b` right, `x` left, `y` upper."""
 STICK_REST_MAX: Final = DEAD_ZONE
-"""Largest deflection of a released stick.
+"""Deflection up to which a stick counts as released.
 
-Within it the rest position is learned. It does not exceed the dead zone, so a stick that was held
-while its rest was learned commands no motion after its release.
+Rest positions are learned only up to this value, which equals the dead zone. So a stick that was
+held while its rest was learned commands no motion after its release.
 """
 TRIGGER_REST_MAX: Final = 0.1
-"""Largest deflection of a released trigger."""
+"""Deflection up to which a trigger counts as released."""
 _FULL: Final = 32767.0
 
 
@@ -43,7 +43,7 @@ class Gamepad:
     """
 
     def __init__(self, index: int, *, hold: str = "rightshoulder", stop: str = "b") -> None:
-        """Open a pad by its SDL index, with the names of the dead man's button and the stop."""
+        """Open a pad by its SDL index; `hold` names the dead man's button, `stop` the stop."""
         self._pad = sdl2.SDL_GameControllerOpen(index)
         self.name = _text(sdl2.SDL_GameControllerNameForIndex(index))
         self.gone, self.stopped, self.settled = not self._pad, False, False
@@ -99,7 +99,10 @@ class Gamepad:
         return off / (1.0 - rest if off > 0.0 else 1.0 + rest)
 
     def settle(self) -> str:
-        """Learn the rest positions of released sticks and triggers; return the next instruction."""
+        """Learn the rest positions once sticks, triggers and dead man's button are released.
+
+        Return the next instruction to the person, or "" once settled.
+        """
         held = []
         for name, shown in (STICKS | TRIGGERS).items():
             off = abs(self._position(name))
@@ -116,7 +119,7 @@ class Gamepad:
         return ""
 
     def wait(self, timeout_s: float) -> None:
-        """Process the events that arrive within a time, s."""
+        """Wait for an event, at most a timeout, s; process all events that have arrived."""
         event = ctypes.byref(self._event)
         came = sdl2.SDL_WaitEventTimeout(event, round(1000 * timeout_s))
         while came:
@@ -136,7 +139,7 @@ class Gamepad:
 
 
 def start_sdl() -> None:
-    """Start SDL's gamepads, without a display and without its own signal handlers."""
+    """Start SDL's gamepad support, without a display and without SDL's signal handlers."""
     with warnings.catch_warnings():  # the package warns that it uses its own library
         warnings.simplefilter("ignore")
         require("pad", "lead with the keyboard: --keys")
@@ -159,7 +162,7 @@ def find_pad(wanted: str | None) -> int:
             return index
         found.append(shown if is_known else f"{shown}, whose axes are unknown to SDL")
     raise FleetError(
-        f"no gamepad{'' if wanted is None else f' {wanted!r}'}: "
+        f"no gamepad{'' if wanted is None else f' {wanted!r}'}; found: "
         f"{'; '.join(found) or 'none that this user may read'}; join group `input`, "
         "map an unknown pad with SDL_GAMECONTROLLERCONFIG, or use --keys"
     )

@@ -1,4 +1,4 @@
-"""Commands of a person with sticks or keys: height, pitch and assist, within limits. Pure."""
+"""Height, pitch and assist that a person commands with sticks or keys, within limits."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ PITCH_RATE: Final = 0.4
 ASSIST_RATE: Final = 40.0
 """N/s at full deflection."""
 DEAD_ZONE: Final = 0.2
-"""Deflection that counts as zero: a worn stick rests up to 15 % away from its earlier position."""
+"""Deflection up to which it counts as zero: a worn stick rests up to 15 % off its old position."""
 
 
 class Deflection(NamedTuple):
-    """Deflections of the sticks, each from -1 to 1."""
+    """Deflections that command height, pitch and assist, each from -1 to 1."""
 
     height: float = 0.0
     pitch: float = 0.0
@@ -43,7 +43,7 @@ class Pilot:
         self.led = Led(clamp(height, *HEIGHTS), clamp(pitch, *PITCHES), 0.0)
 
     def limit_assist(self, given_n: float) -> None:
-        """Reduce the request to the assist that the planner gives now, N."""
+        """Reduce the request to at most the assist that the planner gives now, N."""
         self.led = self.led._replace(assist_n=max(0.0, min(self.led.assist_n, given_n)))
 
     def integrate(self, wanted: Deflection, dt: float) -> Led:

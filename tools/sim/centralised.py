@@ -1,13 +1,12 @@
-"""A baseline to compare with: the planner computes every torque, the joint services none.
+"""A baseline for comparison: the planner computes every torque, the joint services none.
 
-It runs in virtual time only. No service imports it and no robot file names it: `xrl sim --control`
-and `xrl study latency --control` select it by name. The planner's law is the shipped one. The
-planner also computes the joint services' part,
+It runs only in virtual time: `xrl sim --control` and `xrl study latency --control` select it. The
+planner runs the shipped law, and also computes the joint services' part,
 
     tau = D (q_ref - q) + D_B (v_ref - v) + tau_ff + tau_coupled
 
-from the states that it has, as one torque for each joint. The modules send it to the drives
-unchanged until the next one arrives. Pure.
+from the states that it has received, as one torque for each joint. The modules send this torque to
+the drives unchanged until the next torque arrives. Pure.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from tools.sim.lockstep import Lockstep
 
 
 class _LeadsOn(Engagement):
-    """Engages as shipped, then leads with any states, because no lower tier could hold."""
+    """Engagement that never ends, whatever the states, because no lower tier could hold."""
 
     def advance(
         self,
@@ -58,10 +57,9 @@ class _LeadsOn(Engagement):
 
 
 class _CentralPlanner(Planner):
-    """The shipped planner, whose commands are whole torques."""
+    """The shipped planner, with whole torques as commands."""
 
     def __init__(self, config: RobotConfig, session: int) -> None:
-        """Take the robot and the session, as the shipped planner does."""
         super().__init__(config, session)
         self.state.engagement = _LeadsOn()
 
@@ -72,13 +70,13 @@ class _CentralPlanner(Planner):
         return [_whole(*pair) for pair in zip(commands, states, strict=True)] if commands else []
 
     def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
-        """Return inputs and decisions of the last tick, without margins: no part stands alone."""
+        """Return inputs and decisions of the last tick; margins are 0, as no tier holds alone."""
         status = super().status(now_ns, tick_us)
         return msgspec.structs.replace(status, margin=0.0, margin_onboard=0.0)
 
 
 def _whole(command: JointCommand, state: JointState) -> JointCommand:
-    """Return the command with its whole torque at a state as one `tau_ff`."""
+    """Return a command whose `tau_ff` is the whole torque at a state."""
     return msgspec.structs.replace(
         command,
         v_ref=pd_law.ZERO,
@@ -95,14 +93,13 @@ def _whole(command: JointCommand, state: JointState) -> JointCommand:
 class _PassThrough(DriveManager):
     """A joint module that forwards torques.
 
-    It comes up as the shipped module does, from the hoist through HOLD into TRACK. After that blend
-    it has no law: the newest received torque goes to the drive, however old. The torque limiter
-    keeps only the torque diamond. After an e-stop, or with a lost drive, the shipped module's law
-    applies again.
+    It starts like the shipped module, on the hoist, through HOLD into TRACK. After the blend into
+    TRACK it has no law: it sends the newest received torque to the drive, however old, within the
+    torque diamond. After an emergency stop, or with a lost drive, the shipped module's law applies
+    again.
     """
 
     def __init__(self, config: RobotConfig, name: str) -> None:
-        """Take the robot and the module's name."""
         super().__init__(config, name)
         self._blend_ns = config.joint_service.blend_ms * NS_PER_MS
         self._tau_module_max = config.joint.tau_module_max
@@ -129,7 +126,7 @@ class _PassThrough(DriveManager):
         if reading is not None:
             controller.estimate.process(reading, armed=True)
         if command is not None and all(map(math.isfinite, command.tau_ff)):
-            controller.failsafe.command = command  # its age goes into the states
+            controller.failsafe.command = command  # the states report its age
             controller.tau = limit_differential(command.tau_ff, self._tau_module_max)
         torque = motor_torque(controller.tau, self._gear_ratio)
         return DriveAction(None, DriveCommand.TORQUE, torque, None, ArmingInhibit.NONE)
@@ -140,16 +137,16 @@ class _PassThrough(DriveManager):
 
 
 def torques_only(config: RobotConfig) -> RobotConfig:
-    """Return the robot with drives that take torques and hold nothing on their own.
+    """Return the robot with drives in torque mode, which cannot hold on their own.
 
-    Its joint services accept any command, because this planner sends gains of zero.
+    Its joint services check no envelope, because this planner sends gains of zero. Trips are off.
     """
     service = msgspec.structs.replace(config.joint_service, loop="service")
     return msgspec.structs.replace(untripped(believing(config)), joint_service=service)
 
 
 class CentralisedLockstep(Lockstep):
-    """A whole fleet in virtual time, each torque computed by the planner."""
+    """A whole fleet in virtual time whose planner computes every torque."""
 
     planner_type = _CentralPlanner
     module_type = _PassThrough
@@ -164,4 +161,4 @@ CONTROLS: Final[Mapping[str, type[Lockstep]]] = {
     SHIPPED: Lockstep,
     "centralised": CentralisedLockstep,
 }
-"""Fleets by where their torques are computed."""
+"""Type of fleet for each value of `--control`."""

@@ -2,7 +2,7 @@
 
 World, twelve emulated axes, six joint services, harness, IMU and planner step in a fixed order.
 Messages between them pass through a modelled network. The services are those of a live fleet,
-without process, clock or bus: two runs with one seed are equal to the last bit.
+without processes, clocks or a bus, so two runs with the same seed are equal to the last bit.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from tools.sim.virtual_services import (
 )
 
 SETTLE_NS = NS_PER_S
-"""Time from when all six modules track to the scenario's start, ns."""
+"""Time from the moment when all six modules track to the scenario's start, ns."""
 READY_NS = 20 * NS_PER_S
-"""Virtual time by which the scenario must have started, ns: 19 s of a run, which starts at 1 s."""
+"""Virtual time by which the scenario must have started, ns: 19 s after the start of a run."""
 
 Happening = Kill | Restart | Push | HandRow
 """Action of a scenario, or of a person who watches the run."""
 Watch = Callable[[SimTruth], None]
-"""Receives the truth of the simulated world at its rate."""
+"""Called with each truth of the simulated world that a run yields."""
 
 
 def forget(_topic: Topic, _module: str, _message: Message) -> None:
@@ -65,12 +65,12 @@ def forget(_topic: Topic, _module: str, _message: Message) -> None:
 
 
 class FleetMoment(msgspec.Struct, frozen=True):
-    """State of the simulated world and of each service at one moment of a run."""
+    """State of the simulated world, the joint services and the planner at one moment of a run."""
 
     state: SimState
     """World and drives."""
     modules: Mapping[str, DriveManagerState]
-    """State of each joint service by name; a service that is missing is dead."""
+    """State of each joint service by name; a missing service is dead."""
     planner: tuple[int, PlannerState] | None
     """Session and state of the planner; None if it is dead."""
 
@@ -117,23 +117,23 @@ class Lockstep:
         """Put the robot on the hoist, drives idle.
 
         Args:
-            config: the robot as its controllers know it.
-            scenario: what happens; it may kill and restart the planner and, with the onboard loop,
-                joint services.
+            config: robot file of the controllers.
+            scenario: course of the run; it may kill and restart the planner and, with the onboard
+                loop, joint services.
             network: impairment of every link, each way; None is a delay of 1 ms. The scenario's
-                impairments come on top.
-            seed: seed of the network and of the harness sensor's noise.
+                impairments are added.
+            seed: seed of the network and of the sensors' noise.
             record: called with every message.
-            clocks: by service, the clock of a host off virtual time; not the simulator's.
+            clocks: clocks of hosts that differ from virtual time, by service.
             plant: how the true robot differs from `config`; None for the realistic default.
             hand: recorded path of the hand, which replaces the scenario's.
             controller: makes a custom controller for each planner.
-            planner_beside: True if the planner's process is on the joint services' host, where its
-                end is seen at once; otherwise its commands become stale, which is harder.
-            traced: also record what re-execution of the services needs.
+            planner_beside: True if the planner runs on the joint services' host, which detects its
+                end at once. Otherwise only the age of its commands reveals the end, later.
+            traced: True to also record the inputs for re-execution of the services.
 
         Raises:
-            RunError: the scenario kills a service that cannot be killed here.
+            RunError: the scenario kills or restarts a service that lockstep cannot kill.
         """
         self._check_kills(config, scenario)
         self.config, self.scenario = config, scenario
@@ -189,7 +189,6 @@ class Lockstep:
         self._progress = _Progress(sorted(happens, key=lambda row: row.at))
 
     def _request(self) -> OperatorRequest:
-        """Return the operator's request to the planner."""
         wanted = self.world.lead()
         return OperatorRequest(wanted.assist, wanted.shift, SCENARIO)
 
@@ -231,7 +230,7 @@ class Lockstep:
         )
 
     def resume(self, moment: FleetMoment) -> None:
-        """Continue from a moment of another run, before the first step; links are empty then."""
+        """Continue from a moment of another run; only before the first step. Links start empty."""
         state, modules = moment.state, moment.modules
         step_ns = self._robot.every.step
         self.time.now_ns = -(-state.t_ns // step_ns) * step_ns
@@ -245,10 +244,10 @@ class Lockstep:
         ]
 
     def run(self) -> Iterator[SimTruth]:
-        """Run to the scenario's end; yield the truth at its rate.
+        """Run to the scenario's end; yield the truth at the rate of its topic.
 
-        Scenario time is negative before the scenario starts. The run ends early if the robot has
-        fallen by then, or if the scenario has not started when virtual time is past `READY_NS`.
+        Scenario time is negative before the scenario starts. The run ends early if the robot falls
+        before the start, or if the scenario has not started by `READY_NS`.
         """
         every = self._robot.every
         while self.world.scenario_s < self.scenario.duration:
@@ -289,7 +288,7 @@ class Lockstep:
         self.time.now_ns += robot.every.step
 
     def lead(self, hand: HandLead) -> None:
-        """Set the hand's lead in place of the scenario's, and record it."""
+        """Lead the hand in place of the scenario, and record it."""
         self._progress.led += 1
         hand = msgspec.structs.replace(hand, t_ns=self.now_ns, seq=self._progress.led)
         self.world.take_hand(hand)
@@ -346,8 +345,8 @@ class Lockstep:
         for service, at in named + [(row.service, row.at) for row in scenario.restart]:
             if service not in killable:
                 raise RunError(
-                    f"{service}@{at:g}: in lockstep only the planner can be killed, and "
-                    "joint services with the onboard loop; use `xrl demo` for the others"
+                    f"{service}@{at:g}: lockstep can kill and restart only the planner and, with "
+                    "the onboard loop, joint services; use `xrl demo` for the others"
                 )
 
 
@@ -357,12 +356,13 @@ NOTHING_HAPPENS: Final = Scenario(
 
 
 def begin_standing(fleet: Lockstep) -> bool:
-    """Start a new fleet when the robot stands, all six track and its scenario begins.
+    """Start a new fleet with the robot standing, all six modules in TRACK, as its scenario begins.
 
-    Standing up takes 3.6 s of each run. For many runs of one robot on one plant, the robot stands
-    up once in each process, and each run continues from there. Standing up itself is tested by
+    Standing up takes 3.6 s of each run. So in each process a robot stands up once per plant, and
+    its runs continue from there. Standing up itself is tested by
     `tests/lockstep/test_dead_services.py` and by the sweeps over drawn plants, which start on the
-    hoist. Returns False if this robot never leads on this plant: it then starts on the hoist.
+    hoist. Returns False if this robot's scenario never begins on this plant; the fleet then starts
+    on the hoist.
     """
     start = standing(fleet.config, fleet.plant)
     if start is not None:
@@ -371,7 +371,7 @@ def begin_standing(fleet: Lockstep) -> bool:
 
 
 def standing(robot: RobotConfig, plant: PlantConfig) -> FleetMoment | None:
-    """Return the moment at which a scenario begins with `BASE`, or None if it never does."""
+    """Return the moment at which a scenario begins over `BASE` links; None if it never does."""
     schedule = robot.gain_schedule
     key = (to_toml(robot), plant_to_toml(plant), schedule.digest if schedule else "")
     if key not in _known:

@@ -1,8 +1,8 @@
 """Modelled network links, seeded, with the scenario's impairments (docs/architecture.md). Pure.
 
-A link's own impairment and those of `xrl sim --inject` are both `shared.config.impairment`, which
-the network proxy of a live fleet uses too. A link here is never given up: there is neither lease
-nor dialling, and a stream delivers everything that a partition held back, however long it lasted.
+A link's own impairment and those of `xrl sim --inject` use `shared.config.impairment`, as the
+network proxy of a live fleet does. A modelled link has no lease and is never redialled, so a stream
+delivers everything that a partition held back, however long the partition lasted.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ OVERHEAD_BYTES: Final = 40
 
 
 class VirtualLink(Generic[M]):
-    """One direction between two processes; the receiver keeps the newest arrival only.
+    """One direction between two processes; the receiver stores only the newest arrival.
 
-    A message that arrives behind one that was sent later is dropped, as Zenoh does by its own
+    A message that arrives after one that was sent later is dropped, as Zenoh does by its own
     sequence numbers.
     """
 
     def __init__(self, base: Impairment, name: str, seed: int) -> None:
-        """Start empty; `base` is the link's own impairment, the name one of `shared.links`."""
+        """Start empty with the link's own impairment `base`; `name` is one of `shared.links`."""
         self.direction = Direction(name, seed)
         self.overtaken = 0
-        """Messages that arrived too late, or twice, and were dropped."""
+        """Number of messages that arrived too late, or twice, and were dropped."""
         self._base = Impairer(base, f"{seed} {name} base")
         self._queue: list[tuple[int, int, M]] = []  # by arrival
         self._held: list[tuple[int, M]] = []
@@ -59,7 +59,7 @@ class VirtualLink(Generic[M]):
                 self._enter(self._behind(now_ns, release_ns), self._sent, message)
 
     def take(self, now_ns: int) -> M | None:
-        """Return the newest message that has arrived, as a ring of depth 1 does; else None."""
+        """Return the newest message since the last call, or None, like a ring of depth 1."""
         newest = None
         while self._queue and self._queue[0][0] <= now_ns:
             _, number, message = heapq.heappop(self._queue)
@@ -70,7 +70,7 @@ class VirtualLink(Generic[M]):
         return newest
 
     def release(self, now_ns: int) -> None:
-        """Release what an ended partition held back: in order, each with its delay."""
+        """Release the messages that an ended partition held back, in order and with their delay."""
         if not self._held:
             return
         impairer = self.direction.active
@@ -83,9 +83,9 @@ class VirtualLink(Generic[M]):
             self._enter(release_ns, number, message)
 
     def _behind(self, now_ns: int, release_ns: int) -> int:
-        """Return when a message passes: not before messages that still wait on a stream.
+        """Return when a message passes, not before messages that still wait on a stream.
 
-        This holds even if those were sent under an impairment that has ended.
+        This applies even if the impairment under which those were sent has ended.
         """
         if now_ns < self._stream_ns:
             release_ns = max(release_ns, self._stream_ns)
@@ -106,7 +106,7 @@ class VirtualLink(Generic[M]):
 
 
 class VirtualNetwork:
-    """Every link.
+    """All links.
 
     Attributes:
         links: by direction, as named in `shared.links`.
@@ -119,9 +119,9 @@ class VirtualNetwork:
         seed: int,
         record: Callable[[LinkEvent], None],
     ) -> None:
-        """Start with every link's own impairment; `injects` are further ones, with their times.
+        """Start the links with the impairment `base`; `injects` are further, timed impairments.
 
-        `record` is called with an event whenever one of those starts or ends.
+        `record` is called with an event whenever one of `injects` starts or ends.
         """
         self.links: dict[str, VirtualLink[Any]] = {
             name: VirtualLink(base, name, seed) for name in DIRECTIONS
@@ -133,13 +133,13 @@ class VirtualNetwork:
             self._injections.plan(inject.link, inject, inject.at, inject.until)
 
     def advance(self, scenario_s: float, now_ns: int) -> None:
-        """Start and end what is due, and release the messages held until then."""
+        """Start and end impairments that are due; release messages held by an ended partition."""
         if self._injections.advance(scenario_s, now_ns):
             for link in self.links.values():
                 link.release(now_ns)
 
     def cut(self, link: str, for_s: float, scenario_s: float, now_ns: int) -> None:
-        """Cut off links of `shared.links` for `for_s` seconds, as a person who watches requests."""
+        """Cut links of `shared.links` for `for_s` seconds, as requested by a person who watches."""
         self._injections.begin(link, Impairment(partition=True), scenario_s + for_s, now_ns)
 
     def active(self, scenario_s: float) -> tuple[str, ...]:
@@ -151,5 +151,5 @@ class VirtualNetwork:
         )
 
     def end(self, now_ns: int) -> None:
-        """End all impairments, so that their counts are recorded: the run is over."""
+        """End all impairments at the end of a run, so that their counts are recorded."""
         self._injections.clear("all", now_ns)

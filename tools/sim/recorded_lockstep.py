@@ -34,11 +34,11 @@ Outcome = TypeVar("Outcome")
 AFTER_FALL_S: Final = 1.0
 """Time for which a recorded run continues after a fall, s, so that the log shows it."""
 DRAIN_EVERY: Final = 512
-"""Number of waiting messages at which they are written."""
+"""Number of waiting messages from which all of them are written to the log."""
 
 
 class RecordedMessages:
-    """Messages on their way into the log."""
+    """Queue of messages for the log."""
 
     def __init__(self, robot: str) -> None:
         self._robot = robot
@@ -52,8 +52,8 @@ class RecordedMessages:
     def put(self, topic: Topic, module: str, message: Message) -> None:
         """Queue a message as the bus would.
 
-        Its arrival time is never before the previous message's, although a joint service whose
-        drive is silent stamps its states with the last sample that it received.
+        Arrival times never decrease, although a joint service with a silent drive stamps its states
+        with the time of the last sample.
         """
         self._newest_ns = max(self._newest_ns, message.t_ns)
         self._queue.append((topic.key(self._robot, module), encode(message), self._newest_ns))
@@ -75,9 +75,9 @@ def record_run(
 ) -> Outcome:
     """Record one run into `run.mcap` with its inputs beside it, and return what `run` returned.
 
-    `run` gets the function that records a message and the one that receives the truth, and
-    simulates `true_plant`. `metadata` is added to the log's, with at least `lockstep`: the command
-    or the network. The files `attached` are attached to the log as well.
+    `run` must simulate `true_plant`. It receives two functions: one records a message, the other
+    receives the truth. `metadata` is added to the log's metadata. Its key `lockstep` must
+    describe the command or the network. The files `attached` are attached to the log.
 
     Raises:
         RunError: the log cannot be written.
@@ -129,10 +129,9 @@ def simulate(
 ) -> float:
     """Record a run of the fleet in virtual time, to its end or one second past a fall.
 
-    Returns the simulated time, s. `network` applies to every link, beside the scenario's own
-    impairments; `seed` is for the sensors' noise and for the network. `control` is a key of
-    `CONTROLS`; `hand` leads in place of the scenario; `controller`, `FILE.py[:NAME]`, replaces the
-    law.
+    Returns the simulated time, s. `network` applies to every link, in addition to the scenario's
+    impairments; `seed` is for the sensors' noise and the network. `control` is a key of `CONTROLS`;
+    `hand` leads in place of the scenario; `controller`, `FILE.py[:NAME]`, replaces the law.
 
     Raises:
         RunError: the log cannot be written.

@@ -1,6 +1,6 @@
-"""A module's drive in lockstep: driver and bus in one, directly on the emulated axes.
+"""A module's drive in lockstep: a model of driver and bus that acts on the emulated axes.
 
-The bus has the kernel's queue in front of it (`shared.can.interface`).
+The bus includes the kernel's send queue (`shared.can.interface`).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import DriveConfig
 
 ASK_EVERY_NS: Final = 100 * NS_PER_MS
-"""Period of heartbeats, ns; with each one of an idle axis, the CAN driver requests its count."""
+"""Period of heartbeats, ns; the CAN driver requests an idle axis's count at each of them."""
 
-# Compared in each cycle: docs/contributing.md, The control path.
+# Constants for comparisons in each cycle (docs/contributing.md, The control path)
 _LOST, _IDLE, _ARMED = DriveStatus.LOST, DriveStatus.IDLE, DriveStatus.ARMED
 _UNACKNOWLEDGED: Final = DriveStatus.UNACKNOWLEDGED
 _CLOSED_LOOP: Final = AxisState.CLOSED_LOOP_CONTROL
@@ -39,14 +39,14 @@ class VirtualBus:
     """Carries a row of frames at once while a node acknowledges it; otherwise the row waits.
 
     Attributes:
-        acknowledged: True while some node is there.
-        choked: True while frames of others fill the send queue, which then accepts none of ours.
+        acknowledged: True while a node acknowledges frames.
+        choked: True while other nodes' frames fill the send queue, which then accepts no row.
         ages_ns: ages of the rows that waited and then reached their drive.
         thrown_away: number of rows that waited and were discarded.
     """
 
     def __init__(self, bank: AxisBank, axes: Sequence[int]) -> None:
-        """Take the drives, and the axes (0 .. 11) on this bus."""
+        """Connect the axes (0 .. 11) of the bank that are on this bus."""
         self.acknowledged, self.choked = True, False
         self.thrown_away = 0
         self.ages_ns: list[int] = []
@@ -54,7 +54,7 @@ class VirtualBus:
         self._waiting: list[tuple[int, Apply]] = []
 
     def advance(self, now_ns: int) -> None:
-        """Update which nodes are there; deliver waiting rows if any node is."""
+        """Update whether a node acknowledges; if so, deliver the waiting rows."""
         conditions = self._conditions
         deaf = conditions.silent | conditions.deaf
         self.acknowledged = not (deaf and deaf.issuperset(self._axes))
@@ -66,10 +66,7 @@ class VirtualBus:
                 apply()
 
     def put(self, now_ns: int, apply: Apply) -> None:
-        """Send a row that may have to wait; if the socket has no room for it, it is dropped.
-
-        A probe may go to a bus that has come back.
-        """
+        """Send a row, which waits while no node acknowledges; drop it if the queue is full."""
         if self.acknowledged:
             apply()
         elif len(self._waiting) < QUEUED_MAX:
@@ -87,7 +84,7 @@ class VirtualBus:
 
 
 class VirtualDrive:
-    """One ODrive of the bank: a `Drive`, in its own turns (`WiredDrive` has the joint's)."""
+    """One ODrive of the bank, as a `Drive` in the drive's turns (`WiredDrive` converts them)."""
 
     def __init__(
         self,
@@ -100,10 +97,10 @@ class VirtualDrive:
         counts_per_turn: int,
         tells_heat: bool = False,
     ) -> None:
-        """Set the drives, the index of this one (0 .. 5), its service's clock, and the bus.
+        """Connect drive `index` (0 .. 5) of the bank to its service's clock and its bus.
 
-        Without a bus, the drive has one of its own, on which a node always acknowledges.
-        `tells_heat`: it reports its thermistors once a second, as firmware 0.6 does.
+        Without a `bus`, the drive has a separate bus, on which a node always acknowledges. With
+        `tells_heat` it reports its thermistors once a second, as firmware 0.6 does.
         """
         self._bus = bus or VirtualBus(bank, (2 * index, 2 * index + 1))
         self._watch = BusWatch(echoes=True)
@@ -125,13 +122,13 @@ class VirtualDrive:
         self._watch.received(self._sampled_ns)
 
     def start_service(self) -> None:
-        """Start with a new service, which reads the torques that an armed drive carries."""
+        """Connect a new service, which first reads the torques that an armed drive applies."""
         self._written = False
         self._watch = BusWatch(echoes=True)
         self._put(self._clock(), self._feed)  # its first request
 
     def read(self, timeout_s: float) -> DriveReading | None:  # noqa: ARG002 - it is there at once
-        """Return what a driver would: None during a short silence, then LOST."""
+        """Return a reading: for a silent drive None at first, then LOST or UNACKNOWLEDGED."""
         bank, (a, b), now_ns = self._bank, self._axes, self._clock()
         is_responding = bank.is_responding(a)
         self._look_after(now_ns, is_responding=is_responding)
@@ -200,7 +197,7 @@ class VirtualDrive:
         self._send(apply)
 
     def write(self, target: MotorTarget) -> None:
-        """See `Drive.write`; element by element, at a third of the cost of slices."""
+        """See `Drive.write`. Assigning single elements costs a third of what slices cost."""
         bank, (a, b) = self._bank, self._axes
 
         def apply() -> None:
@@ -261,7 +258,7 @@ class VirtualDrive:
             for axis in self._axes:
                 bank.request_state(axis, AxisState.CLOSED_LOOP_CONTROL)
 
-        # The at most two cycles between the probe and its echo are not modelled.
+        # The delay of up to two cycles between the probe and its echo is not modelled.
         self._send(apply)
 
     def _send(self, apply: Apply) -> None:
@@ -272,7 +269,7 @@ class VirtualDrive:
             self._put(now_ns, apply)
 
     def _put(self, now_ns: int, apply: Apply) -> None:
-        """Put a row on the bus; a drive that is there receives it and feeds its watchdogs."""
+        """Put a row on the bus; a drive that responds receives it and feeds its watchdogs."""
         bus = self._bus
         if bus.choked:
             self._watch.refused(now_ns)
@@ -293,7 +290,7 @@ class VirtualDrive:
         self._bank.feed(*self._axes)
 
     def _look_after(self, now_ns: int, *, is_responding: bool) -> None:
-        """Watch the bus as the CAN link does, whose own frames come back once they are carried."""
+        """Watch the bus as the CAN link does, which receives its own frames once they are sent."""
         watch, bus = self._watch, self._bus
         if is_responding:
             watch.received(now_ns)

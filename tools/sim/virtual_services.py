@@ -43,8 +43,8 @@ Record = Callable[[Topic, str, Message], None]
 class HostClock:
     """The monotonic clock of one host.
 
-    It does not step with the time of day, but no two hosts agree on it, so an age is measured on
-    one clock only (docs/architecture.md#age-rule).
+    It does not step with the time of day, but differs between hosts, so an age is measured on one
+    clock only (docs/architecture.md#age-rule).
     """
 
     def __init__(self, offset_ns: int = 0, drift_ppm: float = 0.0) -> None:
@@ -58,12 +58,12 @@ class HostClock:
         return now_ns + self.offset_ns + drift_ns
 
     def step(self, by_ns: int) -> None:
-        """Step the clock, which a monotonic clock never does."""
+        """Step the clock, which never happens to a real monotonic clock."""
         self.offset_ns += by_ns
 
 
 class VirtualTime:
-    """Virtual time of a run; its processes see it only through their host's clock."""
+    """Virtual time of a run, which its processes read only through their host's clock."""
 
     def __init__(self, now_ns: int) -> None:
         self.now_ns = now_ns
@@ -82,12 +82,12 @@ class _LinkInbox(Generic[M]):
         self._link, self._time = link, time
 
     def take(self) -> M | None:
-        """Return the newest message that has arrived and was not taken before."""
+        """Return the newest message since the last call, or None."""
         return self._link.take(self._time.now_ns)
 
 
 class _RecordOutbox(Generic[M]):
-    """The sending end of a link, if there is a receiver, and of the record: an `Outbox`."""
+    """An `Outbox` that records messages and, with a `link`, sends them."""
 
     def __init__(
         self,
@@ -101,7 +101,6 @@ class _RecordOutbox(Generic[M]):
         self._link, self._time = link, time
 
     def put(self, message: M, /) -> bool:
-        """Send and record."""
         if self._link is not None and self._time is not None:
             self._link.put(self._time.now_ns, message)
         self._record(self._topic, self._module, message)
@@ -132,7 +131,7 @@ class SharedMemory:
 
 
 class _Neighbourhood:
-    """One module's place in the shared memory: other modules, stops, the planner's end."""
+    """One module's access to the shared memory: other modules, stops, the planner's end."""
 
     def __init__(
         self, memory: SharedMemory, index: int, time: VirtualTime, clock: Callable[[], int]
@@ -153,7 +152,7 @@ class _Neighbourhood:
         return view_of(MODULES[self._index], self._memory.rows, self._time.now_ns)
 
     def write(self, row: NeighbourRow, *, is_dead: bool = False) -> None:
-        """Write this module's row; a dead module without a sample counts as one that was there."""
+        """Write this module's row; the stamp of a dead module without a sample is not 0."""
         offset_ns = self._clock() - self._time.now_ns
         if not row.t_ns:
             row = row._replace(t_ns=int(is_dead))
@@ -170,7 +169,7 @@ class VirtualJoint:
     """A joint service.
 
     Attributes:
-        frozen: stopped or dead; it runs no cycle, and its drive keeps its last target.
+        frozen: True if stopped or dead: it runs no cycle, and its drive keeps its last target.
     """
 
     def __init__(
@@ -243,12 +242,12 @@ class VirtualJoint:
         return self._loop.cycle()
 
     def kill(self, *, for_good: bool) -> None:
-        """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
+        """Freeze the service; with `for_good` it is dead, and a restart replaces it."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
         self._write_row(is_dead=self._is_dead)
 
     def restart(self) -> None:
-        """Continue a frozen service; a dead one is replaced, and takes over its armed drive."""
+        """Continue a frozen service, or replace a dead one, which takes over its armed drive."""
         self.frozen = False
         if self._is_dead:
             self._is_dead = False
@@ -270,7 +269,7 @@ class VirtualPlanner:
 
     Attributes:
         loop: the planner's loop; None without a planner.
-        frozen: stopped or dead.
+        frozen: True if stopped or dead.
     """
 
     def __init__(
@@ -286,9 +285,9 @@ class VirtualPlanner:
         traced: bool,
         beside: SharedMemory | None,
     ) -> None:
-        """Start the service; `make` makes a planner with a session, now and at each restart.
+        """Start the service; `make` is called with a session, now and at each restart.
 
-        `beside`: memory of the joint services' host, if the planner is on it too.
+        `beside` is the memory of the joint services' host if the planner runs on that host.
         """
         self.frozen = self._is_dead = False
         self._config, self._make, self._clock = config, make, time.on(clock)
@@ -324,7 +323,7 @@ class VirtualPlanner:
         self.loop = None if planner is None else self._loop_of(planner)
 
     def advance(self) -> None:
-        """Receive what has arrived, and tick if a tick is due."""
+        """Receive the states that have arrived, and tick if a tick is due."""
         if self.loop is None or self.frozen:
             return
         host_ns = self._clock()
@@ -332,13 +331,13 @@ class VirtualPlanner:
             self.loop.tick(host_ns)
 
     def kill(self, *, for_good: bool) -> None:
-        """Freeze the service; `for_good`: it is dead, and a restart makes a new one."""
+        """Freeze the service; with `for_good` it is dead, and a restart replaces it."""
         self.frozen, self._is_dead = True, self._is_dead or for_good
         if self._is_dead and self._memory is not None:
             self._memory.ended = self._memory.planner
 
     def restart(self) -> None:
-        """Continue a frozen planner; a dead one is replaced under the next session."""
+        """Continue a frozen planner; a dead planner is replaced, with the next session."""
         self.frozen = False
         if self._is_dead:
             self._is_dead = False
@@ -379,7 +378,7 @@ class VirtualCan(Generic[S]):
 
 
 class VirtualHarness:
-    """Service of the load cells; it begins with a tare, while the hoist holds."""
+    """Service of the load cells; it starts with a tare, while the hoist holds the robot."""
 
     def __init__(
         self,
@@ -404,7 +403,7 @@ class VirtualHarness:
             self._loop.cycle(self._clock())
 
     def assume_tared(self) -> None:
-        """Mark the tare as done: in the middle of a run, the operator's load is on the cells."""
+        """Mark the tare as done: when a run is resumed, the cells carry the operator's load."""
         self._loop.state = tared_state(self._robot.harness.bias)
 
     def tare(self, request: TareRequest) -> None:

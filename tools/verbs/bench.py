@@ -2,7 +2,7 @@
 
 `xrl bench bus` and `xrl bench fleet` measure the bus and the whole fleet. Absolute times on a busy
 machine mean little. To compare two versions, use `--against`, which runs both in turn, or compare
-the ratios of the figures to the yardstick in the same table.
+each figure's ratio to the yardstick of the same table.
 """
 
 from __future__ import annotations
@@ -24,9 +24,7 @@ EXAMPLES: Final = """
 xrl bench
 xrl bench --against HEAD~1
 xrl bench --rounds 25 --json bench.json
-xrl bench bus                                # compare the bus with other transports
 xrl bench bus --transport zenoh --transport datagrams --seconds 30
-xrl bench fleet                              # the whole fleet, live
 xrl bench fleet --against HEAD~1 --rounds 5 --json fleet.json
 """
 
@@ -46,9 +44,9 @@ def run(flags: AgainstFlags) -> int:
             flags, ["bench"], flags.rounds or 9, lambda: bench.turn() if bench else {}, console
         )
     note = (
-        "Each figure is the median over the rounds of a round's median CPU time of the calling "
-        f"thread. Cold: before each call, {SWEPT_BYTES >> 20} MiB are swept and the thread sleeps "
-        f"for {1e3 * ASLEEP_S:g} ms. Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in "
+        "Each figure is the calling thread's CPU time: the median of the rounds' medians. Cold: "
+        f"before each call, {SWEPT_BYTES >> 20} MiB are swept and the thread sleeps for "
+        f"{1e3 * ASLEEP_S:g} ms. Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in "
         "NumPy."
     )
     return finish(flags, [row_of(figure, here, there) for figure in FIGURES], note, console)

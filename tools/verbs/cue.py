@@ -1,8 +1,8 @@
 """`xrl cue`: alerts the wearer as soon as the robot stops or resumes following.
 
-A wearer who continues to lead a robot that holds tips it (docs/results.md#a-hand-that-leads-on). At
-each change the terminal's bell rings, or a command of your own makes a sound, a light or a
-vibration.
+A wearer who keeps leading while the robot holds can tip it over
+(docs/results.md#a-hand-that-leads-on). At each change the terminal's bell rings, or your own
+command makes a sound, a light or a vibration.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Annotated, Final
 
 from shared.bus import topics
 from shared.bus.messages import JointState, Mode, PlannerMode, PlannerStatus
-from shared.bus.session import Latest, Session, open_session
+from shared.bus.pubsub import Latest
+from shared.bus.session import Session, open_session
 from shared.exceptions import FleetError
 from shared.joints import MODULES
 from shared.process import StopFlag
@@ -25,9 +26,9 @@ from tools.terminal import Console
 
 POLL_S: Final = 0.005
 ENDS_IN_S: Final = 1.0
-"""Timeout for the command to end after SIGTERM."""
+"""Timeout for the command to end after SIGTERM, s."""
 SILENT_S: Final = 0.5
-"""A module or planner that is silent for this time counts as not following."""
+"""A module or planner that is silent for this time, s, counts as not following."""
 
 
 class Cue(Enum):
@@ -38,7 +39,7 @@ class Cue(Enum):
     HOLDS = "holds"
     """The robot stands still, whatever the hand does. The wearer should stop leading."""
     SINKS = "sinks"
-    """A module damps or is disarmed: the robot sinks."""
+    """A module is in DAMP, DISARMED or FAULT: the robot sinks."""
     FALLEN = "fallen"
 
 
@@ -58,8 +59,8 @@ def cue_of(modes: Sequence[int | None], planner: int | None) -> Cue:
 
 
 EXAMPLES: Final = """
-xrl cue                          # ring the terminal's bell at each change
-xrl cue play-for-wearer.sh       # run it with the argument holds, follows, sinks or fallen
+xrl cue
+xrl cue play-for-wearer.sh
 xrl cue -- spd-say --rate 50     # speak the state
 """
 
@@ -68,8 +69,8 @@ class CueFlags(RunDirFlags):
     """Command that announces the state."""
 
     command: Annotated[tuple[str, ...], positional("COMMAND")] = ()
-    """command to run at each change, with follows, holds, sinks or fallen as its last argument;
-    without a command the terminal's bell rings"""
+    """command to run at each change, with follows, holds, sinks or fallen as its last argument
+    (default: ring the terminal's bell)"""
 
 
 class _Heard:

@@ -1,4 +1,4 @@
-"""`xrl demo`: the paper's experiment, live: start the fleet, kill the planner, judge."""
+"""`xrl demo`: runs the paper's experiment live: starts the fleet, kills the planner, judges."""
 
 from __future__ import annotations
 
@@ -33,41 +33,38 @@ from tools.terminal import Console, marked
 from tools.view.serving import PortFlags, served_beside
 
 VIEW_S = 3600.0
-"""Maximum length of a run led from the page, s of scenario time."""
+"""Length of a run with --view but without --duration, s of scenario time, unless Ctrl-C ends it."""
 
 
 EXAMPLES: Final = """
 xrl demo
 xrl demo --out out/b --kill planner@6.2 --restart planner@9
 xrl demo --kill planner@3.1:STOP --restart planner@7
-xrl demo --view                        # lead, push and stop it by hand, in a browser
+xrl demo --view                        # in a browser
 xrl demo --scenario crawl --kill planner@8
-xrl demo --jacobian average
 xrl demo --controller examples/lqr_controller.py
-xrl demo --plant drivetrain.stiffness=3000
 xrl demo --duration 8 --push 4:0.3:40,0,0
-xrl demo --pace 0.5
 """
 
 
 class DemoFlags(experiment.ExperimentFlags, PaceFlags, PortFlags):
-    """An experiment, and how the fleet runs it."""
+    """Experiment to run, and options of its fleet."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = ""
-    """scenario: a file, or the name of a scenario that is shipped or in scenarios/ beside the robot
-    file (default: squat, the paper's Fig. 7; with --view: stand)"""
+    """file, or name of a scenario, shipped or in scenarios/ beside the robot file (default: squat,
+    the paper's Fig. 7)"""
     no_restart: bool = False
-    """do not restart services that end on their own. A service killed by --kill stays down until
-    its --restart in either case"""
+    """do not restart services that end on their own; those that --kill or the scenario kills always
+    wait for a requested restart"""
     view: bool = False
-    """show the robot in a browser and let the page act on it; without --scenario and --duration the
-    robot stands until Ctrl-C, then the verdict follows"""
+    """show the robot in a browser, and act on it there, by default in the scenario stand; without
+    --duration the run ends at Ctrl-C or after an hour, then the verdict follows"""
     out: Folder | None = None
-    """folder for the results (default: out/demo-<time>)"""
+    """folder for the results (default: a new one in out/)"""
 
 
 def run(flags: DemoFlags) -> int:
-    """Run the experiment; 0 only if the robot stood to the end."""
+    """Run the experiment; return 0 only if the robot stood to the end."""
     require("sim")
     if flags.view:
         require("view", "leave out --view")
@@ -96,7 +93,7 @@ def _lead_run(
     """Run the scenario on its own fleet and show it."""
     console.print(
         f"starting {len(robot.services)} services; modes below: right ankle, knee, hip, then left; "
-        "D disarmed, H hold, T track, F fault, - silent",
+        "D disarmed or damp, H hold, T track, F fault, - silent",
         style="dim",
     )
 

@@ -46,12 +46,12 @@ GROUPS: Final = (COMPUTER, ROBOT, CAN, DRIVES, HARNESS, IMU)
 
 
 class DoctorFlags(FleetRobotFlags):
-    """Form of the report."""
+    """Format of the report."""
 
     verbose: bool = False
-    """also show each check that is ok"""
+    """also show checks that are ok"""
     json: bool = False
-    """print every row as JSON"""
+    """print JSON"""
 
 
 def run(flags: DoctorFlags) -> int:
@@ -74,7 +74,7 @@ def run(flags: DoctorFlags) -> int:
 
 
 def survey(robot: RobotConfig, config_path: Path, run_dir: Path, progress: Progress) -> Groups:
-    """Check everything; if no fleet is up, start an emulated robot's simulator for the checks."""
+    """Check everything; for an emulated robot without a fleet, start its simulator meanwhile."""
     fleet_is_up = is_up(run_dir)
     progress("this computer, the robot file, the bus")
     groups: Groups = {
@@ -183,7 +183,7 @@ class _Usb:
             )
         trouble = f"{serial}: {found.troubles.get(serial, 'not connected')}{there}"
         if self._services_up and self._on_usb:
-            return trouble, "its joint service holds the USB; run `xrl down` first"
+            return trouble, "its joint service uses the USB; run `xrl down` first"
         return trouble, "plug in its USB cable; check its supply, libusb-1.0 and the udev rule"
 
     def _unreached(self, subject: str, found: str, fix: str) -> Finding:

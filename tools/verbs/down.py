@@ -1,4 +1,4 @@
-"""`xrl down`: lower the robot, stop the fleet, and leave nothing behind."""
+"""`xrl down`: lowers the robot and stops the fleet."""
 
 from __future__ import annotations
 
@@ -15,11 +15,8 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.live.descent import WAYS, lower
 
 EXAMPLES: Final = """
-xrl down                      # lower a robot that bears weight, and wait until it is hung
-xrl down --wait 300
-xrl down --limp               # idle the drives at once: a standing robot falls
-xrl down --lower-only         # lower it and wait; the services keep running
-xrl down --sit                # also lower a simulated robot, which is otherwise stopped at once
+xrl down                      # lower the robot, wait for the hoist
+xrl down --limp
 xrl down --limp --keep-stops  # from a systemd unit
 """
 
@@ -34,7 +31,7 @@ class DownFlags(RunDirFlags):
     sit: Annotated[bool, Arg(exclusive="weight")] = False
     """also lower a simulated robot (default: stop the simulator at once)"""
     wait: Duration = 60.0
-    """timeout for a hoist or stand to take the weight of the lowered robot, s"""
+    """timeout for a hoist or stand to take the lowered robot's weight, s"""
     keep_stops: bool = False
     """keep an emergency stop in force for the next `xrl up --disarmed`"""
 

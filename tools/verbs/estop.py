@@ -1,4 +1,4 @@
-"""`xrl estop` and `xrl pendant`: set every module to DAMP, now or when a dead man's handle ends."""
+"""`xrl estop` and `xrl pendant`: set every module to DAMP, now or when a pendant falls silent."""
 
 from __future__ import annotations
 
@@ -36,12 +36,10 @@ OTHER_S: Final = 0.2
 
 EXAMPLES: Final = """
 xrl estop
-xrl estop --run-dir /tmp/lab
-xrl estop --local                       # on the robot's own host: needs no bus
+xrl estop --local                       # on the robot's host, without the bus
 xrl estop --config lab.toml             # from another computer, with an operator's key
-xrl estop --config lab.toml --wait      # open the links now, and stop on Enter or Ctrl-C
+xrl estop --config lab.toml --wait
 xrl pendant               # Enter lays it down without a stop; Ctrl-C stops every module
-xrl pendant --for 600     # lay it down after ten minutes
 """
 
 
@@ -51,29 +49,23 @@ class EstopFlags(Flags):
     run_dir: Annotated[Path, parsed(Path, "DIR")] = dataclasses.field(
         default_factory=default_run_dir  # of any user: anyone who can reach the robot may stop it
     )
-    """run directory, which identifies the fleet and holds its logs (default: $XRL_RUN_DIR, else
-    /tmp/xrl-UID)"""
+    """the fleet's run directory, with its logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID)"""
     local: bool = False
-    """stop only the joint services on this host, through shared memory (default: also over the
-    bus)"""
+    """stop only this host's joint services, through shared memory (default: also over the bus)"""
     partly: Annotated[
         tuple[str, ...] | None, parsed(names_of(MODULES), "MODULE,...", is_one=True)
     ] = None
-    """with --local: only these modules must stop, because the others are on other hosts (default:
-    all)"""
+    """with --local: modules of this host that must stop (default: all six)"""
     wait: bool = False
-    """open the links now, report whether all six modules respond, and stop on Enter, Ctrl-C or
-    when the terminal closes; q and Enter quits without a stop"""
+    """connect now, report silent modules, and stop on Enter, Ctrl-C or a closed terminal;
+    typing q and Enter quits without a stop"""
     config: Annotated[
         Path | None,
-        Arg(
-            help="robot file (default: that of the fleet in the run directory, else "
-            f"{ROBOT_FILE} of the working directory)"
-        ),
+        Arg(help=f"robot file (default: the fleet's, else {ROBOT_FILE} in the working directory)"),
     ] = None
 
     def check(self) -> None:
-        """Refuse flags that do not apply to the chosen way."""
+        """Refuse flags that do not apply to the chosen way of stopping."""
         super().check()
         if self.partly and not self.local:
             raise FleetError("--partly needs --local: over the bus all six modules must stop")
@@ -111,7 +103,7 @@ def estop(flags: EstopFlags) -> int:
 
 
 def _is_here(flags: EstopFlags) -> bool:
-    """Return True if the run directory is of the robot given by --config, or none was given."""
+    """Return True if the fleet of the run directory uses the --config file, or none is given."""
     if flags.config is None:
         return True
     manifest = RunDir(flags.run_dir).read_manifest()
@@ -122,11 +114,14 @@ def _robot(flags: EstopFlags) -> RobotConfig:
     """Return the requested robot, or the one whose fleet is up."""
     if flags.config is not None:
         return load(flags.config)
-    manifest = RunDir(flags.run_dir).read_manifest()  # whether or not its supervisor lives
+    manifest = RunDir(flags.run_dir).read_manifest()  # even if its supervisor is dead
     if manifest is not None:
         return manifest.robot()
     if places.robot_file_here() is None:  # no module would receive a stop for the shipped robot
-        raise FleetError(f"no fleet is up in {flags.run_dir}; give its robot file with --config")
+        raise FleetError(
+            f"no fleet is up in {flags.run_dir}; to stop a robot on another host, give that "
+            "robot's file with --config"
+        )
     return load(places.robot_file())
 
 
@@ -161,8 +156,8 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
 def _conclude(going: list[str], which: str) -> None:
     refuse_going(going)
     Console().print(
-        f"{which} are stopped (DAMP). The robot sinks slowly; modules beside a limp or dead one "
-        "hold. To end the stop, run `xrl rearm` or `xrl down`"
+        f"{which} are stopped (DAMP). The robot sinks slowly; modules beside a limp or dead "
+        "module hold. To end the stop, run `xrl rearm` or `xrl down`"
     )
 
 
@@ -170,16 +165,16 @@ class PendantFlags(RunDirFlags):
     """Duration of the pendant."""
 
     for_s: Annotated[Duration | None, option("--for")] = None
-    """lay the pendant down after S seconds"""
+    """lay the pendant down after S seconds, without a stop"""
 
 
 def pendant(flags: PendantFlags) -> int:
-    """Send heartbeats until the pendant is laid down or stops the modules; return 0 for either."""
+    """Send heartbeats until the pendant is laid down or stops the modules; both return 0."""
     try:
         handle = Pendant(flags.run_dir, MODULES)
     except OSError as error:
         raise FleetError(
-            f"{flags.run_dir}: no shared memory for the pendant: {error.strerror}"
+            f"{flags.run_dir}: cannot open the pendant's shared memory: {error.strerror}"
         ) from None
     if not handle.modules:
         raise FleetError(

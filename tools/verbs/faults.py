@@ -21,7 +21,6 @@ _LABEL_WIDTH = 12
 
 EXAMPLES: Final = """
 xrl faults
-xrl faults --json
 xrl sim --fault knee_left:encoder@4     # reproduce one
 """
 
@@ -40,7 +39,7 @@ class FaultsFlags(ConfigFlags):
     """Robot whose limits are shown, and the output format."""
 
     json: bool = False
-    """print the table as JSON"""
+    """print JSON"""
 
 
 def run(flags: FaultsFlags) -> int:
@@ -73,14 +72,14 @@ def run(flags: FaultsFlags) -> int:
 
 
 def sections(limits: TripsConfig) -> Iterator[_FaultSection]:
-    """Yield the faults of drives, the losses and the trips."""
+    """Yield the tables of drive faults, losses and trips."""
     yield _FaultSection(
         "Drive faults",
         """\
-The module goes to FAULT and the planner holds the other five. An axis that disarms floats; its
-sibling keeps its torque until the service idles it, at once. Nothing is re-armed automatically: a
-person removes the cause, then restarts the module's service (`xrl kill MODULE`). To reproduce a
-fault: `xrl sim --fault knee_left:encoder@4`.""",
+Unless the row says "no FAULT", the module goes to FAULT, and the planner holds the other five. An
+axis that disarms floats; the service then idles its sibling at once. Nothing is re-armed
+automatically: a person removes the cause, then restarts the module's service (`xrl kill MODULE`).
+To reproduce a fault: `xrl sim --fault knee_left:encoder@4`.""",
         ("fault", "meaning", "drive", "limp", "zero lost", "cause", "what to do"),
         [
             (
@@ -93,7 +92,7 @@ fault: `xrl sim --fault knee_left:encoder@4`.""",
     )  # fmt: skip
     yield _FaultSection(
         "A lost process or link, and the emergency stop",
-        "A joint service holds its module while the planner or its link is gone.",
+        '"Module" is the affected module, or all six; "others" are the rest and the planner.',
         ("lost", "module", "others", "you see", "recovery"),
         [(name, *loss) for name, loss in LOSSES.items()],
     )
@@ -102,10 +101,9 @@ fault: `xrl sim --fault knee_left:encoder@4`.""",
     yield _FaultSection(
         "Trips",
         """\
-A trip stops the robot from being led: a module or the planner detects that a quantity is beyond its
-limit, and all six modules go to HOLD. The planner leads again after a wait that grows with each
-trip. The limits are in `[trips]` of the robot file.""",
-        ("trip", "detected by", "measured", "limit", "what to do"),
+On a trip all six modules go to HOLD. The planner leads again after a wait that grows with each
+trip. After a trip of its own, every value must also have been within its limit for a second.""",
+        ("trip", "detected by", "condition", "limit", "what to do"),
         [
             (name, by, row.measured, _limit(row, getattr(limits, row.key)), row.recovery)
             for name, by, row in trips

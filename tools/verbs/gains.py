@@ -30,9 +30,9 @@ from tools.lab.design.dynamic_certificate import (
 from tools.terminal import Console
 
 ROOM_EVERY = 5
-"""The printed figures are computed at every n-th pose."""
+"""The printed dynamic figures are computed at every n-th pose."""
 SHOWN = 6
-"""Heights in the printed table."""
+"""Number of heights in the printed table."""
 
 
 STIFFNESS_ROWS = (
@@ -46,26 +46,24 @@ STIFFNESS_ROWS = (
 
 EXAMPLES: Final = """
 xrl gains
-xrl gains --config lab.toml
 xrl gains --config lab.toml --damping-of deploy/robot.gains.json
 xrl gains --check
-xrl gains --stiffness
 """
 
 
-class GainsFlags(ConfigFlags):
+class _GainsFlags(ConfigFlags):
     """Robot of the schedule, and whether to compute or check it."""
 
     damping_of: Path | None = None
-    """take damping and coupling from another schedule, such as deploy/robot.gains.json, and check
-    them with the dynamic certificate; without this flag, search for them (two minutes)"""
+    """take damping and coupling from this schedule, such as deploy/robot.gains.json, and check them
+    with the dynamic certificate (default: search for them, which takes two minutes)"""
     check_only: Annotated[bool, option("--check", exclusive="only")] = False
     """only check whether the schedule fits the robot"""
     stiffness: Annotated[bool, Arg(exclusive="only")] = False
-    """only print the stiffness that the body needs to balance (paper section IV)"""
+    """only print the stiffness that balance requires (paper section IV)"""
 
 
-def run(flags: GainsFlags) -> int:
+def run(flags: _GainsFlags) -> int:
     """Write the schedule beside the robot file; with --check, only check the existing schedule."""
     robot = config_file.load_without_schedule(flags.config)
     if flags.stiffness:

@@ -28,15 +28,15 @@ from tools.terminal import Console, marked
 
 DEFAULT_HOSTS: Final = Path("hosts.toml")
 EXAMPLES: Final = """
-xrl hosts files -o out/hosts               # write each host's files into a folder, to inspect them
-xrl keys make --hosts hosts.toml           # once: the authority, and a certificate for each service
-xrl hosts update                           # send the files over ssh
-xrl hosts check                            # versions, keys, clocks, units
+xrl hosts files -o out/hosts               # to inspect them
+xrl keys make --hosts hosts.toml           # once
+xrl hosts update
+xrl hosts check
 xrl hosts up
 xrl hosts status
 xrl hosts estop
-xrl hosts down                             # lower the robot first, and wait until a hoist bears it
-xrl hosts down --limp                      # idle the drives at once: a standing robot falls
+xrl hosts down                             # lower the robot, wait for the hoist
+xrl hosts down --limp
 """
 
 
@@ -46,7 +46,7 @@ class HostsFlags(ConfigFlags):
     names: Annotated[tuple[str, ...], positional("HOST")] = ()
     """only these hosts (default: all)"""
     hosts: Path = DEFAULT_HOSTS
-    """hosts file, which lists the services of each host"""
+    """file that lists each host's services"""
     authority: Folder | None = None
     """folder of the certificate authority (default: ~/.config/xrl/ROBOT/authority)"""
 
@@ -55,7 +55,7 @@ class FilesFlags(HostsFlags):
     """Folder to write to."""
 
     out: Annotated[Path, option("-o", "--out", metavar="DIR")]
-    """folder to write to"""
+    """output folder"""
 
 
 class UpdateFlags(HostsFlags):
@@ -69,7 +69,7 @@ class HostsUpFlags(HostsFlags):
     """State in which the drives start."""
 
     disarmed: bool = False
-    """leave drives idle, except those that already hold"""
+    """arm no drive until a person requests it (`xrl kill MODULE`), but take over holding drives"""
 
 
 class HostsDownFlags(HostsFlags):
@@ -78,7 +78,7 @@ class HostsDownFlags(HostsFlags):
     limp: bool = False
     """idle the drives at once, under any load: a standing robot falls"""
     wait: Duration = 60.0
-    """timeout for a hoist or stand to take the weight of the lowered robot, s"""
+    """timeout for a hoist or stand to take the lowered robot's weight, s"""
 
 
 class _Given(NamedTuple):
@@ -130,7 +130,9 @@ def files(flags: FilesFlags) -> int:
             try:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             except OSError as error:
-                raise RunError(f"{path.parent}: cannot be created: {error.strerror}") from None
+                raise RunError(
+                    f"{path.parent}: cannot be created: {error.strerror}; choose another --out"
+                ) from None
             write_atomically(path, file.content, private=file.of_service)
         print(f"{out / remote.host.name}: {', '.join(remote.host.services)}")
     if given.authority() is None:
@@ -153,7 +155,7 @@ def update(flags: UpdateFlags) -> int:
 
 
 def up(flags: HostsUpFlags) -> int:
-    """Start all hosts, check all, and only then arm: a stop on one host holds for all."""
+    """Start and check all hosts, and only then arm: a stop on one host applies to all."""
     given = _given(flags)
     failed_to_start = _each(given, running.start)
     if failed_to_start or flags.disarmed:
@@ -205,7 +207,7 @@ def status(flags: HostsFlags) -> int:
 
 
 def check(flags: HostsFlags) -> int:
-    """Check all hosts; return the exit code of a fault if one is not as it should be."""
+    """Check all hosts; return the exit code of a fault if one has a fault or hosts disagree."""
     given = _given(flags)
     files = given.files()
     found = on_all(
@@ -225,7 +227,7 @@ def check(flags: HostsFlags) -> int:
 
 
 def _each(given: _Given, work: Callable[[Remote], str]) -> int:
-    """Do the same on all hosts and print each result at once; return 0 if all succeeded."""
+    """Run a function for all hosts and print each result at once; return 0 if all succeeded."""
     found = on_all(given.remotes, work, _tell)
     failed = any(isinstance(result, FleetError) for result in found.values())
     return FAULT_EXIT_CODE if failed else 0

@@ -21,30 +21,28 @@ from tools.terminal import Console
 RULE: Final = "if a link has several impairments, a partition applies, else the one that began last"
 
 ABOUT: Final = f"""
-LINK is {", ".join(GROUPS)}, or one direction, such as 'planner->ankle_left',
-'knee_right->planner', 'harness->planner'. These apply to every message on it:
+LINK is {", ".join(GROUPS)},
+or one direction, such as 'planner->ankle_left' or 'harness->planner'. The words are:
   delay=TIME         30, 30ms, 0.03s or 500us
-  jitter=TIME        half the width if uniform, else the standard deviation; a message whose delay
-                     would be negative has no delay
+  jitter=TIME        half the width if uniform, else the standard deviation; a delay is at least 0
   distribution=KIND  of the jitter: uniform (default), normal, pareto
-  loss=SHARE         probability of loss, 0.2 or 20%; 1 means every message, not 1%
+  loss=SHARE         probability of loss, 0.2 or 20%; 1 is every message
   burst=N            mean number of losses in a row (1)
   duplicate=SHARE    share of messages that arrive twice
-  reorder=SHARE      share of messages without delay
-  rate=BYTES         capacity of the link, bytes (not bits) per second
+  reorder=SHARE      share of messages without delay, which overtake others
+  rate=BYTES         capacity, bytes (not bits) per second
   partition          no message passes
-  ordered            behave like a stream: a late message delays those behind it, and a partition
-                     holds messages back until it ends; loss still loses messages, and nothing is
-                     resent. Without `ordered` the link behaves like datagrams: a message that is
+  ordered            stream: a late message delays those behind it, a partition holds messages back,
+                     and lost messages are not resent. Without it, datagrams: a message that is
                      overtaken or meets a partition is lost
-  at=T, for=T        start in T seconds from now (0); duration (until --clear, or the fleet's end)
-A message here is a Zenoh batch: messages sent together travel together and are lost together.
+  at=T, for=T        start T seconds from now (0); duration (until --clear or the fleet's end)
+Messages sent together are one Zenoh batch, which is delayed or lost as a whole.
 {RULE[0].upper()}{RULE[1:]};
-when that ends, the others apply again.
+when it ends, this rule selects the next one.
 """
 EXAMPLES: Final = """
-xrl up --injectable                                       # needed first
-xrl inject 'planner->joints delay=30ms jitter=10ms for=4' # same words as --inject of demo and sim
+xrl up --injectable                                       # required first
+xrl inject 'planner->joints delay=30ms jitter=10ms for=4'
 xrl inject 'all loss=20% burst=5'
 xrl inject 'planner->left partition ordered at=2 for=1'
 xrl inject --list
@@ -70,7 +68,7 @@ class InjectFlags(RunDirFlags):
     list: Annotated[bool, Arg(one_of="what")] = False
     """list active and planned impairments"""
     clear: Annotated[str | None, parsed(_link, "LINK", one_of="what")] = None
-    """end every impairment that affects the link, in all its directions"""
+    """end every impairment that affects this link, on all links that it affects"""
 
 
 def run(flags: InjectFlags) -> int:

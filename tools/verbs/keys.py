@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from shared.bus.credentials import keys_folder
-from shared.bus.topics import PRINCIPALS
 from shared.config import files as config_file
 from shared.config.endpoints import ROBOT, filled
 from shared.config.robot_config import RobotConfig
@@ -37,8 +36,8 @@ EXAMPLES: Final = """
 xrl keys make --config lab.toml                       # once, on the computer that keeps the keys
 xrl keys make --hosts hosts.toml                      # ... for a robot on several hosts
 xrl keys pack planner harness recorder operator -o body.keys.tar
-xrl keys pack --install                               # install all on this host
-xrl keys check                                        # check this host's keys
+xrl keys pack --install
+xrl keys check
 xrl keys renew --all                                  # before they expire
 xrl keys revoke operator                              # after a laptop was lost
 """
@@ -48,7 +47,7 @@ class KeysFlags(ConfigFlags):
     """Robot and authority of the keys."""
 
     hosts: Path | None = None
-    """take the services' addresses from this hosts file (default: from the robot file)"""
+    """hosts file with the services' addresses (default: those in the robot file)"""
     authority: Folder | None = None
     """folder of the certificate authority (default: ~/.config/xrl/ROBOT/authority)"""
 
@@ -68,12 +67,10 @@ class MakeFlags(KeysFlags):
 
 
 class RenewFlags(MakeFlags):
-    """Certificates to make again."""
+    """Certificates to replace."""
 
-    names: Annotated[
-        tuple[str, ...],
-        positional("NAME", one_of="which", help=", ".join(PRINCIPALS)),
-    ] = ()
+    names: Annotated[tuple[str, ...], positional("NAME", one_of="which")] = ()
+    """certificates, such as planner or operator"""
     all: Annotated[bool, Arg(one_of="which")] = False
     """all certificates"""
 
@@ -130,12 +127,12 @@ def renew(flags: RenewFlags) -> int:
     robot = flags.robot()
     authority, names = _named(flags, robot)
     authority.renew(robot, names, flags.days)
-    print(f"{authority.folder}: {_count(names)} renewed; pack them for each of their hosts")
+    print(f"{authority.folder}: {_count(names)} renewed; pack them for their hosts")
     return 0
 
 
 def revoke(flags: RenewFlags) -> int:
-    """Make certificates of the next generation."""
+    """Make certificates of the next generation, in place of those that are revoked."""
     robot = flags.robot()
     authority, names = _named(flags, robot)
     authority.revoke(robot, names, flags.days)

@@ -29,16 +29,16 @@ from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 
 PERIOD_S: Final = 0.05
-"""Period of each request, s: an intent fades out, and a push ends, unless it is repeated."""
+"""Period of each request, s: an intent fades out unless it is repeated."""
 LINKS_S: Final = 3.0
 SETTLE_S: Final = 60.0
 """Timeout for releasing the sticks and pressing the dead man's button once, s."""
 KEY_HELD_S: Final = 0.1
-"""A key press is a full deflection for the time since the last poll, at most this time, s."""
+"""Maximum time for which a key press counts, s: full deflection since the last poll."""
 
 
 class Key(Enum):
-    """Keys with a function, and their deflections."""
+    """Functions of keys, with the deflection that each commands."""
 
     UP = (1.0, 0.0, 0.0)
     DOWN = (-1.0, 0.0, 0.0)
@@ -60,7 +60,7 @@ KEYS: Final = {
 
 
 EXAMPLES: Final = """
-xrl lead                 # the first gamepad: hold the right shoulder button and move the sticks
+xrl lead                 # hold the right shoulder button and move the sticks
 xrl lead --keys          # arrows: height and pitch; +, -: assist; o: unpark; space: stop
 xrl lead --pad Xbox --hold leftshoulder --stop x
 """
@@ -70,10 +70,9 @@ class LeadFlags(RunDirFlags):
     """Device that leads the robot."""
 
     keys: Annotated[bool, Arg(exclusive="by")] = False
-    """lead with the keyboard of this terminal, not a gamepad"""
+    """use this terminal's keyboard, not a gamepad"""
     pad: Annotated[str | None, Arg(metavar="NAME", exclusive="by")] = None
-    """part of the gamepad's name or path, such as Xbox or /dev/input/event7 (default: the first
-    one)"""
+    """part of the gamepad's name or path, such as Xbox (default: the first gamepad)"""
     hold: Annotated[str, Arg(choices=BUTTONS)] = "rightshoulder"
     """dead man's button"""
     stop: Annotated[str, Arg(choices=BUTTONS)] = "b"
@@ -101,13 +100,11 @@ def run(flags: LeadFlags) -> int:
         if ended is not Key.STOP:
             console.print(f"ended: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
             if pad is not None and pad.gone:
-                raise FleetError(
-                    f"{pad.name}: lost; plug it in, or bring it into its receiver's range"
-                )
+                raise FleetError(f"{pad.name}: connection lost; plug it in, or bring it into range")
             return 0
         request_here(fleet.run.path)
         refuse_going(BusStop(robot, session, fleet.run.path).stop())
-    console.print("stopped (DAMP). The robot sinks slowly; `xrl status` says how to recover")
+    console.print("stopped (DAMP). The robot sinks slowly; `xrl status` shows how to recover")
     return 0
 
 
@@ -134,7 +131,7 @@ class _Leader:
         self._sent = 0
 
     def take_hold(self) -> None:
-        """Resume leading, with the assist that is given now instead of the one requested before."""
+        """Resume leading, with the present assist instead of the assist requested before."""
         status = self._newest()
         self.pilot.limit_assist(0.0 if status is None else status.assist_n)
 

@@ -19,13 +19,12 @@ from tools.flags import Flags, positional
 HOSTS_FILE: Final = "hosts.example.toml"
 _ABOUT_PLANTS: Final = (
     "# Differences of the true robot from robot.toml, for the simulator: --plant plants/{}.toml\n"
-    "# Missing keys are as in `realistic`, the simulator's default without --plant.\n"
+    "# Missing keys have the values of `realistic`, the default without --plant.\n"
 )
 
 
 EXAMPLES: Final = """
 xrl new lab                     # then: cd lab; every verb finds robot.toml there
-xrl new .                       # here, if this directory is empty
 """
 
 
@@ -33,7 +32,7 @@ class NewFlags(Flags):
     """Directory to create."""
 
     directory: Annotated[Path, positional("DIR")]
-    """directory; created if it does not exist, otherwise it must be empty"""
+    """new or empty directory"""
 
 
 def run(flags: NewFlags) -> int:
@@ -92,8 +91,8 @@ def _made(directory: Path) -> bool:
             raise RunError(f"{directory}: not a directory; give a new or empty one") from None
         if not any(directory.iterdir()):
             return False
-        right = "nothing in it is replaced; give a new or empty directory"
-        raise RunError(f"{directory}: not empty, and {right}") from None
+        right = "no file in it was changed; give a new or empty directory"
+        raise RunError(f"{directory}: not empty; {right}") from None
     return True
 
 

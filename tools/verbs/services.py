@@ -13,11 +13,11 @@ from tools.fleet.supervise import SupervisedFleet
 
 EXAMPLES: Final = """
 xrl start planner       # after `xrl up --no-planner`: it leads once all six modules are ready
-xrl start knee_left     # at once, even if the supervisor waits after several failures
-xrl kill planner                        # dead at once; the supervisor restarts it
-xrl kill planner --signal STOP          # frozen, like a hung process
-xrl kill planner --signal CONT          # resumed
-xrl kill knee_left                      # its drive holds; the new service takes it over
+xrl start knee_left     # at once, even while the supervisor delays a restart
+xrl kill planner                        # the supervisor restarts it
+xrl kill planner --signal STOP          # freeze it, like a hung process
+xrl kill planner --signal CONT
+xrl kill knee_left                      # its drive holds until the new service takes over
 xrl rearm               # once the robot is at rest: all six hold, then the planner leads
 """
 
@@ -26,13 +26,14 @@ class ServiceFlags(RunDirFlags):
     """Service to act on."""
 
     service: Annotated[str, positional("SERVICE")]
-    """name of the service, as shown by `xrl status`"""
+    """service, as in `xrl status`"""
 
 
 class KillFlags(ServiceFlags):
     """Signal to send."""
 
     signal: Literal["KILL", "STOP", "CONT", "TERM"] = "KILL"
+    """signal to send"""
 
 
 def start(flags: ServiceFlags) -> int:

@@ -1,4 +1,4 @@
-"""`xrl sim`: runs an experiment in virtual time, in one process, bit-identical and fast."""
+"""`xrl sim`: runs an experiment in virtual time, in one process, reproducible to the last bit."""
 
 from __future__ import annotations
 
@@ -32,32 +32,28 @@ EXAMPLES: Final = """
 xrl sim
 xrl sim --delay 10 --out out/slow
 xrl sim --delay 5 --jitter 5 --loss 0.1 --seed 3
-xrl sim --scenario crawl --kill planner@8
 xrl sim --delay 50 --control centralised
 xrl sim --plant drivetrain.stiffness=3000 --plant drivetrain.play=0.01
-xrl sim --plant ideal
-xrl sim --controller examples/lqr_controller.py
-xrl sim --scenario stand --hand out/view/run.mcap     # repeat how a person led it
-xrl sim --inject 'planner->joints delay=30 jitter=10 at=3 for=4'
+xrl sim --scenario stand --hand out/view/run.mcap     # repeat a person's motion
 xrl sim --inject 'all partition at=3 for=2' --inject 'planner->left loss=0.5 at=6'
 """
 
 
-class SimFlags(experiment.ExperimentFlags):
-    """An experiment, the network it runs over, and who computes the torques."""
+class _SimFlags(experiment.ExperimentFlags):
+    """Experiment to run, its network, and where the torques are computed."""
 
     delay: Milliseconds = 1.0
     """delay of every link, each way"""
     jitter: Milliseconds = 0.0
-    """half the width of a uniform distribution"""
+    """half the width of the delay's uniform distribution"""
     loss: Annotated[float, Range(0.0, 1.0, ""), Arg(metavar="P")] = 0.0
     """probability that a message is lost"""
     control: Annotated[str, Arg(choices=CONTROLS)] = SHIPPED
-    """where torques are computed; centralised: all in the planner, as a baseline for comparison"""
+    """where torques are computed; centralised, all by the planner, is a baseline"""
     hand: Annotated[Path | None, Arg(metavar="RUN")] = None
-    """repeat the hand and pushes of this record (`operator/hand`) instead of the scenario's path"""
+    """repeat this record's hand and pushes instead of the scenario's path"""
     out: Folder | None = None
-    """folder for the results (default: out/sim-<time>)"""
+    """folder for the results (default: a new one in out/)"""
 
     def check(self) -> None:
         """Refuse two controllers."""
@@ -68,8 +64,8 @@ class SimFlags(experiment.ExperimentFlags):
             )
 
 
-def run(flags: SimFlags) -> int:
-    """Run the experiment; 0 only if the robot stood to the end."""
+def run(flags: _SimFlags) -> int:
+    """Run the experiment; return 0 only if the robot stood to the end."""
     require("sim")
     console = Console()
     robot, scenario = experiment.make_robot(flags), experiment.make_scenario(flags)
@@ -116,7 +112,7 @@ def _path_of(record: Path) -> tuple[HandRow, ...]:
     path = hand_path(log)
     if not path and log.messages(topics.OPERATOR_HAND):
         raise RunError(
-            f"{record}: no scenario ran while the hand was led; record one with `xrl demo --view`"
+            f"{record}: no scenario ran while the hand was led; record a run with `xrl demo --view`"
         )
     if not path:
         raise RunError(

@@ -15,7 +15,6 @@ from tools.terminal import Console, renewed
 
 EXAMPLES: Final = """
 xrl status
-xrl status --watch
 xrl status --json | jq .services.planner
 """
 
@@ -24,14 +23,14 @@ class StatusFlags(RunDirFlags):
     """Output format, and whether to refresh it."""
 
     json: Annotated[bool, Arg(exclusive="form")] = False
-    """print JSON, in SI units"""
+    """print JSON"""
     watch: Annotated[bool, Arg(exclusive="form")] = False
     """refresh until Ctrl-C"""
 
 
 def run(flags: StatusFlags) -> int:
     """Show the fleet once, or until interrupted."""
-    fleet = SupervisedFleet.attach(flags.run_dir, warn=False)  # the table shows it
+    fleet = SupervisedFleet.attach(flags.run_dir, warn=False)  # the table shows the warning
     robot = fleet.manifest.robot()
     with open_session(robot, "status", fleet.run.path) as session:
         monitors = monitors_of(session, fleet.manifest.topics)

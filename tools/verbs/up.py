@@ -1,4 +1,4 @@
-"""`xrl up`: start the fleet."""
+"""`xrl up`: starts the fleet."""
 
 from __future__ import annotations
 
@@ -42,49 +42,45 @@ SETTLE_S = 3.0
 EXAMPLES: Final = """
 xrl up
 xrl up --scenario crawl --out out/crawl
-xrl up --ros2                                  # show it to ROS 2: docs/ros2.md
-xrl up --ros2 --domain 7 --accept estop        # and let ROS 2 stop it
-xrl up --injectable                            # then: xrl inject 'all delay=30'
+xrl up --ros2 --domain 7 --accept estop        # let ROS 2 stop the robot
 xrl up --config lab.toml --no-sim
-xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # services of one host
-xrl up --config lab.toml --no-sim --only hip_left,host_recorder         # with a record on this host
-xrl up --config lab.toml --no-sim --disarmed   # from a systemd unit
+xrl up --config lab.toml --no-sim --only ankle_left,knee_left,hip_left  # one host's services
+xrl up --config lab.toml --no-sim --only hip_left,host_recorder         # recorded on this host
+xrl up --config lab.toml --no-sim --disarmed   # automatic start, from a systemd unit
 xrl up --config lab.toml --no-sim --readonly   # to move the joints by hand and watch
 """
 
 
 class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
-    """Services to start, and how."""
+    """Services to start, and their options."""
 
     out: Folder | None = None
-    """folder for the record (default: out/<time>)"""
+    """folder for the results (default: a new one in out/)"""
     scenario: Annotated[str | None, Arg(metavar="NAME|FILE")] = None
-    """scenario of the simulated operator once the robot stands: a file, or the name of a scenario
-    that is shipped or in scenarios/ beside the robot file; do its kills yourself (`xrl kill`)"""
+    """scenario for the simulated operator once the robot stands, as for `xrl demo`, but without its
+    kills, restarts and impairments"""
     no_sim: bool = False
     """start no simulator: the drives are real, or a simulator starts later"""
     only: Annotated[
         tuple[str, ...] | None,
         parsed(names_of(), "SERVICE,...", is_one=True),
     ] = None
-    """start only these services; the others run on other hosts, at their endpoints in the robot
-    file"""
+    """start only these services; others run on other hosts, at the robot file's endpoints"""
     no_planner: bool = False
-    """start no planner: the six modules HOLD; `xrl start planner` starts it later"""
+    """start no planner, so all modules hold; `xrl start planner` starts it later"""
     injectable: bool = False
     """put the network proxy between planner, joints and sensors, for `xrl inject`"""
     disarmed: bool = False
-    """arm no drive until a person requests it (`xrl kill MODULE`), but take over drives that
-    already hold; for automatic starts, such as after a power cut"""
+    """arm no drive until a person requests it (`xrl kill MODULE`), but take over holding drives"""
     ros2: bool = False
-    """show the robot to ROS 2 over Zenoh: joint states, transforms, diagnostics (docs/ros2.md)"""
+    """publish joint states, transforms and diagnostics to ROS 2 over Zenoh (docs/ros2.md)"""
     domain: Annotated[int | None, parsed(rmw.domain, "N")] = None
-    """with --ros2: ROS domain (default: $ROS_DOMAIN_ID, else 0)"""
+    """ROS domain (default: $ROS_DOMAIN_ID, else 0)"""
     accept: Annotated[tuple[str, ...] | None, parsed(acceptable, "TOPICS", is_one=True)] = None
-    """with --ros2: let ROS 2 request assist (intent), stop the robot (estop), or both
+    """let ROS 2 request assist (intent), stop the robot (estop), or both
     (intent,estop)"""
     readonly: bool = False
-    """let the joint services read their drives and publish, but send nothing to the drives"""
+    """let the joint services read and publish, but send the drives no commands"""
 
     def check(self) -> None:
         """Refuse flags of services that are not started."""
@@ -104,7 +100,7 @@ class UpFlags(ConfigFlags, RunDirFlags, PlantFlags, ControllerFlags, PaceFlags):
                 )
             absent |= {"simulator", "recorder", "planner", *MODULES} - set(only)
             if HOST_RECORDER in only:
-                absent.discard("recorder")  # flags of one recorder are flags of the other
+                absent.discard("recorder")  # both recorders have the same flags
         for option, is_given, service in (
             ("--scenario", self.scenario is not None, "simulator"),
             ("--plant", bool(self.plant), "simulator"),
@@ -179,7 +175,7 @@ def run(flags: UpFlags) -> int:
 
 
 def _check_keys(robot: RobotConfig, *, must: bool) -> None:
-    """Refuse keys that allow no link; on an automatic start, print a warning instead."""
+    """Refuse unusable keys; on an automatic start, print a warning instead."""
     folder = keys_folder(robot)
     wrong = [f"{row.name}: {row.wrong}" for row in inspect_keys(folder, robot) if row.wrong]
     if not wrong:
@@ -202,7 +198,7 @@ def _make_record_folder(out: Path, *, must: bool) -> None:
 
 
 def _overrides(flags: UpFlags, out: Path) -> dict[str, list[str]]:
-    """Return the arguments that the flags add to the services' own."""
+    """Return each service's additional arguments."""
     overrides = {"recorder": ["--out", str(out.absolute())]}
     if flags.controller is not None:
         overrides["planner"] = ["--controller", absolute(flags.controller)]

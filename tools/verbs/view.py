@@ -12,7 +12,7 @@ from shared import places
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import FleetError, RunError
 from shared.extras import require
-from tools.flags import Run, RunDirFlags, robot_file_of
+from tools.flags import Arg, Run, RunDirFlags
 from tools.fleet.supervise import SupervisedFleet
 from tools.judge.run_parts import PartFlags, read_asked
 from tools.live.experiment import load_robot
@@ -27,11 +27,10 @@ from tools.view.record import RecordFrames, single_file
 from tools.view.serving import PortFlags, serve
 
 EXAMPLES: Final = """
-xrl view                       # show the running fleet, without acting on it
+xrl view                       # show the running fleet
 xrl view --act                 # ... and lead, push, kill, freeze, start, cut, stop
-xrl view out/demo/run.mcap     # write a record as one page: play, pause, step, scrub
-xrl view out/demo/run.mcap --html run.html
-xrl view --sim                 # simulate a robot: lead it, push it, kill its planner
+xrl view out/demo/run.mcap     # write a record as one page
+xrl view --sim
 """
 
 
@@ -42,21 +41,20 @@ class ViewFlags(PortFlags, PartFlags, RunDirFlags):
     sim: bool = False
     """simulate a robot in this process, in virtual time"""
     html: Path | None = None
-    """with a record: path of its page, which needs no server (default: NAME.view.html beside the
-    record)"""
+    """path of a record's page, which needs no server (default: NAME.view.html beside the record)"""
     act: bool = False
     """let the page act on the running fleet; for a real robot you must type its name first"""
-    config: Annotated[Path | None, robot_file_of("that of the record or of the fleet")] = None
+    config: Annotated[Path | None, Arg(metavar="FILE", help=f"with --sim: {places.HELP}")] = None
 
     def check(self) -> None:
         """Refuse flags that contradict a record or --sim."""
         super().check()
         if self.sim and self.record is not None:
-            raise RunError("a record and --sim exclude each other; remove one of them")
+            raise RunError("a record and --sim cannot be combined; remove one of them")
         if self.act and (self.sim or self.record is not None):
             raise RunError(
-                "--act needs a running fleet; remove it: a page always acts on --sim, and never on "
-                "a record"
+                "--act needs a running fleet; remove --act: with --sim a page can always act, and "
+                "with a record never"
             )
         if self.html is not None and self.record is None:
             raise RunError("--html needs a record; give one, such as out/demo/run.mcap")

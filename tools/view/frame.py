@@ -1,4 +1,4 @@
-"""Frames for the page at one moment, and their sources: a record, a fleet, or lockstep."""
+"""Frames for the page, each of one moment, and their sources: a record, a fleet, or lockstep."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tools.judge.reports.robot_pose import pose_of_legs
 from tools.topic_keys import every_key
 
 LEAST_N: Final = 20.0
-"""A sole with less load has no meaningful centre of pressure."""
+"""Load below which a sole has no meaningful centre of pressure, N."""
 
 
 _TOPICS: Final = (
@@ -55,9 +55,9 @@ _TOPICS: Final = (
 SHOWN: Final = tuple(key for key in every_key() if key.topic in _TOPICS)
 """Keys of the messages that a frame needs."""
 STALE_NS: Final = NS_PER_S // 2
-"""An older message is stale and not shown: its sender is dead, stopped or cut off."""
+"""Age from which a message is stale, ns: its sender is dead, stopped or cut off."""
 DIGITS: Final = 5
-"""Decimals: 0.01 mm."""
+"""Decimals of every number; 0.01 mm for lengths."""
 
 
 class _PlannerShown(msgspec.Struct, frozen=True):
@@ -126,17 +126,17 @@ class Frame(msgspec.Struct, frozen=True):
     capture: tuple[float, ...]
     """Capture point: COM + its rate / sqrt(g / height), x and y, m; empty without a planner."""
     soles: tuple[SoleLoad, ...]
-    """Right and left; empty if unknown."""
+    """Loads of the right and the left sole; empty if unknown."""
     soles_estimated: bool
     """True if estimated from the legs' torques, False if from the simulated world."""
     ways_out: tuple[str, ...]
-    """Remedy for each module that lets it track again; empty if none is needed."""
+    """For each module, the remedy that lets it track again; empty if none is needed."""
     processes: tuple[ShownProcess, ...] = ()
     """Processes of a live fleet on this host; empty for the other sources."""
     network: tuple[str, ...] = ()
     """Active impairments of a live fleet's network, in words."""
     stall: str = ""
-    """The last stall of the machine, in words, for a few moments afterwards."""
+    """The last stall of the machine, in words; empty from 2 s after its end."""
 
 
 class Newest:
@@ -153,7 +153,7 @@ class Newest:
         self._first_ns: int | None = None
 
     def add(self, topic: Topic, module: str, message: Message) -> None:
-        """Add a message; those that no frame shows are ignored."""
+        """Store a message as the newest of its key; run events other than stalls are ignored."""
         if not isinstance(message, RunEvent) or message.kind == RunEventKind.STALLED:
             self._rows[topic.name, module] = message
 
@@ -246,7 +246,7 @@ class Newest:
     def estimated_soles(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, ...]:
         """Return the loads of both soles from the joints' torques; empty if a leg is too straight.
 
-        An ankle's torque divided by the load is the distance of the pressure from that ankle.
+        The centre of pressure is away from an ankle by the ankle's torque divided by the load.
         """
         self._measured.update(np.array(q), np.zeros(len(q)))
         loads = self._soles.loads(self._measured.leg_loads(np.array(tau)))
@@ -289,7 +289,7 @@ def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleLoad, ...]:
 
 
 def _short(values: Iterable[float]) -> tuple[float, ...]:
-    """Return numbers rounded for a picture, which halves their length on the wire."""
+    """Return numbers rounded for the page, which halves their length on the wire."""
     return tuple(round(value, DIGITS) for value in values)
 
 

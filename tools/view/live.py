@@ -15,7 +15,8 @@ import msgspec
 from shared.bus import topics
 from shared.bus.credentials import require_operator
 from shared.bus.messages import HandLead, RunEvent, RunEventKind
-from shared.bus.session import Latest, Publisher, Session, open_session
+from shared.bus.pubsub import Latest, Publisher
+from shared.bus.session import Session, open_session
 from shared.bus.topics import Topic
 from shared.clock import now_ns
 from shared.config.robot_config import RobotConfig
@@ -71,7 +72,7 @@ class LiveOrders:
         self._led = self._told = 0
 
     def begin(self, session: Session) -> None:
-        """Use the session that is open while a page is open."""
+        """Use a session, which is open while a page is open."""
         self._hand = HandOrders()
         self._publisher = session.publisher(topics.OPERATOR_HAND, HandLead)
         self._events = session.publisher(topics.RUN_EVENT, RunEvent)
@@ -95,7 +96,7 @@ class LiveOrders:
     def _lead(self, order: Order) -> None:
         publisher = self._publisher
         if publisher is None:
-            raise FleetError("the hand has no link yet")
+            raise FleetError("there is no link to the bus yet")
         self._led += 1
         asked = self._hand.message(order)
         publisher.put(msgspec.structs.replace(asked, t_ns=now_ns(), seq=self._led))
@@ -105,7 +106,9 @@ class LiveOrders:
         request_here(self._fleet.run.path)
         stop = self._stop
         if stop is None:
-            raise FleetError("stopped through shared memory only: there is no link to the bus")
+            raise FleetError(
+                "stopped through shared memory only, on this host: there is no link to the bus"
+            )
         going = stop.stop()
         if going:
             raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
@@ -153,11 +156,11 @@ class LiveOrders:
 
 
 LOOK_S: Final = 1.0
-"""Period of the request to the supervisor for its processes, s."""
+"""Period at which supervisor and network proxy are queried, s."""
 
 
 class LiveSource(Source):
-    """The fleet whose sockets are in a run directory, or on the robot file's hosts."""
+    """Frames of the fleet of a run directory."""
 
     kind = "live"
 

@@ -20,7 +20,7 @@ from tools.view.frame import CUT_S, CUTS, Frame, HandOrders, Newest, Order, Sour
 
 _FOREVER_S: Final = 1e9
 _STEP_S: Final = 0.01
-"""Virtual time per step, s; the orders come between steps."""
+"""Virtual time per step, s; orders are carried out between steps."""
 
 
 class LockstepSource(Source):

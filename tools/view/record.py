@@ -39,7 +39,7 @@ class RecordFrames:
         self._newest = Newest(robot)
         self._keys = [(t, m, log.newest(t, m)) for t, m in SHOWN if t is not topics.RUN_EVENT]
         stalls = [row for row in log.messages(topics.RUN_EVENT) if row.kind == RunEventKind.STALLED]
-        stalls.sort(key=lambda row: row.t_ns)  # an event has the end of its stall, and comes later
+        stalls.sort(key=lambda row: row.t_ns)  # stamped at the stall's end, sent later
         self._keys.append((topics.RUN_EVENT, "", NewestAt(stalls)))
         span = self._data.span
         self.model = msgspec.structs.replace(
@@ -48,7 +48,7 @@ class RecordFrames:
         )  # fmt: skip
 
     def at(self, t_s: float) -> Frame | None:
-        """Return the frame at a time of the timeline, or None before all modules have sent."""
+        """Return the frame at a time of the timeline; None until every module has sent a state."""
         t_ns = self._data.zero_ns + round(t_s * NS_PER_S)
         newest = self._newest
         newest.clear()

@@ -1,7 +1,7 @@
 """The page's server: one asyncio loop, reachable only from this computer and with the token.
 
-Every request needs the token in its path, and this server's own name as Host; a WebSocket also
-needs its Origin. A page from another site in the same browser lacks these.
+Every request needs the token in its path and this server's own name as Host; a WebSocket also needs
+this server as Origin. A page from another site in the same browser lacks the token and the Origin.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ MESSAGE_MAX: Final = 4096
 """Largest message of a page, bytes."""
 CLIENTS_MAX: Final = 8
 ORDERS_MAX: Final = 64
-"""Maximum number of waiting orders of a page; a hand is moved 60 times a second."""
+"""Maximum number of waiting orders of a page; dragging the torso sends about 60 a second."""
 CLOSE_S: Final = 1.0
-"""Timeout for a page to receive the rest and close, s."""
+"""Timeout for a page to receive the remaining messages and close, s."""
 STOPS_MAX: Final = 4
 """Maximum number of concurrent emergency stops; each repeats for up to three seconds."""
 _TYPES: Final = {

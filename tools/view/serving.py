@@ -1,4 +1,4 @@
-"""Serves a page from a process: until Ctrl-C, or beside a fleet while that is up.
+"""Serves a page until Ctrl-C, or from a second process beside a running fleet.
 
 `python -m tools.view.serving PID WORDS` is `xrl WORDS`, but ends when process PID does.
 """
@@ -32,7 +32,7 @@ class PortFlags(Flags):
     """Port of the page's server."""
 
     port: Annotated[
-        int, Range(0, PORT_MAX, ""), Arg(help=f"port on {HOST} (default: {PORT}); 0: any")
+        int, Range(0, PORT_MAX, ""), Arg(help=f"port on {HOST}; 0: any free one (default: {PORT})")
     ] = PORT
 
 
@@ -57,7 +57,7 @@ async def _serve(source: Source, port: int) -> None:
 
 @contextlib.contextmanager
 def served_beside(run_dir: Path, port: int) -> Iterator[str]:
-    """Serve a running fleet from another process, whose page may act; end that afterwards."""
+    """Serve a running fleet's page, which may act, from another process; end it afterwards."""
     command = [sys.executable, "-m", "tools.view.serving", str(os.getpid())]
     command += ["view", "--act", "--run-dir", str(run_dir), "--port", str(port)]
     log = run_dir / "logs" / "view.log"

@@ -20,13 +20,13 @@ HEAT_EVERY_NS: Final = NS_PER_S
 SUPPLY_EVERY_NS: Final = NS_PER_S // 2
 """Period of requests for the supply's voltage, ns."""
 LARGEST: Final = 1e9
-"""Largest target, in any unit; beyond it, single precision holds no fraction."""
+"""Largest target, in any unit; single precision has no fractions long before that."""
 CELSIUS: Final = (-40.0, 200.0)
-"""Valid readings of a thermistor, C; a pin without a thermistor reads 0 or nonsense."""
+"""Valid readings of a thermistor, C; a pin without one reads 0 or an arbitrary value."""
 
 
 def real_readings(first: float, second: float) -> Pair | None:
-    """Return both axes' readings of a thermistor, C, or None unless both are valid."""
+    """Return the thermistor readings of both axes, C; None unless both are valid."""
     low, high = CELSIUS
     both = (first, second)
     real = all(math.isfinite(one) and low < one < high and one != 0.0 for one in both)
@@ -34,7 +34,7 @@ def real_readings(first: float, second: float) -> Pair | None:
 
 
 class DriveReading(msgspec.Struct, gc=False, frozen=True):
-    """Both axes of a module at one moment, at the motors."""
+    """Sample of both axes of a module, at the motors."""
 
     t_ns: int
     """Monotonic time at which the later of the two encoder frames arrived."""
@@ -49,7 +49,7 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
     its take-over."""
     encoder_zero: Pair | None = None
     """Positions at which the encoders' angles within the turn are 0, turns modulo one; None unless
-    the drive has just reported them. `drive.set_position` moves them."""
+    the drive has just reported them. `Drive.set_position` changes them."""
     fet_celsius: Pair | None = None
     """Thermistor readings of the output stages, C; None without new ones."""
     motor_celsius: Pair | None = None
@@ -59,7 +59,7 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
 
     @property
     def angles(self) -> Pair | None:
-        """Angles of both encoders within their motors' turns, turns from 0 to 1.
+        """Angles of both encoders within their motors' turns, as fractions of a turn.
 
         None without new values. Absolute encoders keep the angles without power. For a turning
         motor, the angles are as old as the estimate.
@@ -73,7 +73,7 @@ class DriveReading(msgspec.Struct, gc=False, frozen=True):
 class MotorTarget(msgspec.Struct, gc=False, frozen=True):
     """Target of both motors' own loops, axis0 and axis1 (docs/drives.md).
 
-    torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel), no integrator.
+    The law is torque + vel_gain (clamp(vel_turns + pos_gain (pos_turns - pos)) - vel).
     """
 
     pos_turns: Pair
@@ -88,7 +88,7 @@ class MotorTarget(msgspec.Struct, gc=False, frozen=True):
 
 
 def is_target(target: MotorTarget) -> bool:
-    """Return True if every field is a number that a drive can take, over CAN and USB."""
+    """Return True if every field is a number that drives accept over CAN and USB."""
     for first, second in (
         target.pos_turns,
         target.vel_turns,
@@ -107,7 +107,7 @@ class Drive(Protocol):
     def read(self, timeout_s: float) -> DriveReading | None:
         """Wait for the next encoder sample of both axes; None if it does not arrive in time.
 
-        Never raises for a lost link: the next reading is then `DriveStatus.LOST`, or None.
+        Never raises for a lost link: the next reading is then None or has a `LOST_DRIVE` status.
         """
 
     def write_torque(self, torque: Pair) -> None:
@@ -131,7 +131,7 @@ class Drive(Protocol):
         """Command both axes to go idle."""
 
     def set_position(self, turns: Pair) -> None:
-        """Write both motors' positions, turns, while they are idle; not for the control path.
+        """Write both motors' positions, turns, while they are idle; may wait for the drive.
 
         Raises:
             DriveError: the drive does not accept them.

@@ -1,15 +1,15 @@
 """State of a CAN bus: whether the drive sends, and whether own frames are carried. Pure.
 
-A CAN controller repeats its frame until some node acknowledges it. On a bus whose nodes have no
-power, it repeats without end: later frames wait behind it in the adapter, the interface's queue and
-the socket, and all of them reach the drive when its power is back. The kernel drops none for its
-age. So the link sends no frame that might have to wait:
+A CAN controller repeats a frame until a node acknowledges it: the bus has then carried the frame.
+If no node has power, the controller repeats it endlessly. Later frames wait behind it in the
+adapter, the interface's queue and the socket, and all reach the drive when its power is back. The
+kernel drops no frame because of its age. So the link sends no frame that might have to wait:
 
-- it sends nothing unless the drive was heard within `QUIET_MS`;
-- it sends nothing while an own frame has not come back (CAN_RAW_RECV_OWN_MSGS: the adapter has
-  transmitted it) within `STUCK_MS`;
-- a restart of the interface discards frames that have not come back within `RESTART_MS`;
-- an arming request needs an own frame that was carried within `PROOF_MS`.
+- it sends only probes and first requests unless the drive has sent a frame within `QUIET_MS`;
+- it sends nothing while an own frame has had no echo for `STUCK_MS` (CAN_RAW_RECV_OWN_MSGS: the
+  echo shows that the bus has carried it);
+- it restarts the interface to discard frames without an echo for `RESTART_MS`;
+- it requests arming only if the bus has carried an own frame within `PROOF_MS`.
 
 After an outage, one harmless frame, the probe, must be carried before anything else is sent.
 """
@@ -22,22 +22,22 @@ from typing import Final
 from shared.clock import NS_PER_MS
 
 QUIET_MS: Final = 20
-"""Silence of the drive after which nothing is sent: ten of its encoder frames at 2 ms."""
+"""Silence of the drive after which only probes are sent, ms: ten encoder frames at 500 Hz."""
 STUCK_MS: Final = 15
-"""Time within which any live bus carries an own frame: a queue of 100 frames takes 13 ms."""
+"""Time within which any live bus carries an own frame, ms: a queue of 100 frames takes 13 ms."""
 RESTART_MS: Final = 30
-"""Age at which frames that were not carried are discarded: with a cycle of 5 ms and the restart
+"""Age at which frames that were not carried are discarded, ms: with a cycle of 5 ms and the restart
 itself, none becomes 50 ms old."""
 ASK_AFTER_NS: Final = 4 * NS_PER_MS
-"""Age of an own frame from which the link queries `xrl_unix` whether the bus has carried it, ns:
-the query is a system call."""
+"""Age of an own frame above which the link queries `xrl_unix` for carried frames, ns; each query is
+a system call."""
 PROOF_MS: Final = 50
-"""An arming request goes only to a bus that has carried an own frame within this time."""
+"""Maximum time since the bus carried an own frame, for an arming request, ms."""
 PROBE_MS: Final = 100
-"""Time between two probes of a bus that acknowledges nothing although the drive is heard."""
+"""Period of probes on a bus that carries no own frame although the drive sends, ms."""
 BLOCKED_MS: Final = 100
-"""Time without a carried frame, after one was refused (ENOBUFS) or discarded, after which a drive
-that is heard counts as lost."""
+"""Time without a carried frame, since one was refused (ENOBUFS) or discarded, after which even a
+drive that sends counts as lost, ms."""
 
 _QUIET_NS: Final = QUIET_MS * NS_PER_MS
 _STUCK_NS: Final = STUCK_MS * NS_PER_MS
@@ -45,16 +45,16 @@ _NEVER: Final = -(1 << 62)
 
 
 class BusWatch:
-    """Tracks when the drive was last heard, and which own frames have not been carried yet.
+    """Tracks when the drive last sent a frame, and which own frames have not been carried yet.
 
     Attributes:
-        echoes: True if the interface hands own frames back once they are carried. Otherwise every
-            frame that the bus accepts counts as carried, and hearing the drive is the only proof.
-        unacknowledged: True from when own frames were not carried until one is.
+        echoes: True if the interface returns own frames once they are carried. Otherwise each frame
+            of the drive counts as proof that the bus carries frames.
+        unacknowledged: True after own frames were not carried, until one is.
     """
 
     def __init__(self, *, echoes: bool) -> None:
-        """Start with a bus on which nothing was heard."""
+        """Start with a bus on which no frame has been received."""
         self.echoes = echoes
         self.unacknowledged = False
         self._heard_ns = self._carried_ns = self._probed_ns = _NEVER
@@ -69,7 +69,7 @@ class BusWatch:
             self.carried(now_ns)
 
     def sent(self, now_ns: int) -> None:
-        """Record that the bus accepted an own frame, which it must hand back."""
+        """Record that the bus accepted an own frame, whose echo must follow."""
         if self.echoes:
             self._waiting.append(now_ns)
 
@@ -78,7 +78,7 @@ class BusWatch:
         self._blocked_ns = self._blocked_ns or now_ns
 
     def carried(self, now_ns: int) -> None:
-        """Record an own frame that came back, or one that shows that it was carried.
+        """Record an own frame's echo, or another proof that the bus carries frames.
 
         Frames are carried in order, so frames sent long before were carried too, even if their
         echoes were lost in a full receive buffer.
@@ -93,7 +93,7 @@ class BusWatch:
             waiting.popleft()
 
     def is_heard(self, now_ns: int) -> bool:
-        """Return True if the drive was heard within `QUIET_MS`."""
+        """Return True if the drive has sent a frame within `QUIET_MS`."""
         return now_ns - self._heard_ns <= _QUIET_NS
 
     def may_send(self, now_ns: int) -> bool:
@@ -104,7 +104,7 @@ class BusWatch:
         return not waiting or now_ns - waiting[0] <= _STUCK_NS
 
     def may_arm(self, now_ns: int) -> bool:
-        """Return True if, in addition, the bus has carried a frame within `PROOF_MS`."""
+        """Return True if `may_send`, and if the bus has carried a frame within `PROOF_MS`."""
         return self.may_send(now_ns) and now_ns - self._carried_ns <= PROOF_MS * NS_PER_MS
 
     def carries_nothing(self, now_ns: int) -> bool:
@@ -113,11 +113,11 @@ class BusWatch:
 
     @property
     def waits(self) -> bool:
-        """True while own frames have not come back."""
+        """True while echoes of own frames are missing."""
         return bool(self._waiting)
 
     def heard_in_order(self, now_ns: int) -> bool:
-        """As `heard`; return True if the bus needs no other action of the link in this cycle."""
+        """Record a frame of the drive; return True if the bus needs nothing else in this cycle."""
         if not self.echoes:
             self.received(now_ns)
             return True
@@ -126,18 +126,19 @@ class BusWatch:
         return not self.unacknowledged and (not waiting or now_ns - waiting[0] < ASK_AFTER_NS)
 
     def waited_ns(self, now_ns: int) -> int:
-        """Return the age of the oldest own frame that has not come back, ns; 0 if all have."""
+        """Return the age of the oldest own frame without an echo, ns; 0 if all have one."""
         return now_ns - self._waiting[0] if self._waiting else 0
 
     def restart_due(self, now_ns: int) -> bool:
-        """Return True if waiting frames must no longer reach the drive."""
+        """Return True if waiting frames must be discarded, because they are too old."""
         waiting = self._waiting
         return bool(waiting) and now_ns - waiting[0] > RESTART_MS * NS_PER_MS
 
     def restarted(self, now_ns: int, *, done: bool) -> None:
-        """Record that the interface was restarted, or that this process is not allowed to.
+        """Record that the interface was restarted, or that this process may not restart it.
 
-        Without a restart the frames stay, at most those of `STUCK_MS`, and no silent bus is probed.
+        Without a restart, the waiting frames (sent within about `STUCK_MS`) stay queued, and
+        a silent bus is not probed.
         """
         self.unacknowledged = True
         self.refused(now_ns)
@@ -147,8 +148,8 @@ class BusWatch:
     def probe_due(self, now_ns: int) -> bool:
         """Return True if a probe is due, and count it as sent.
 
-        A bus that has carried nothing is probed as soon as the drive is heard, then every
-        `PROBE_MS`. A silent bus is probed once, to find out whether any node is there.
+        An unacknowledged bus is probed as soon as the drive sends, then every `PROBE_MS`. A bus
+        that has fallen silent is probed once, to find out whether it has any node.
         """
         if not self.echoes or self._waiting or now_ns - self._probed_ns < PROBE_MS * NS_PER_MS:
             return False

@@ -1,4 +1,4 @@
-"""CAN link over python-can, for the drivers: it never blocks or raises, and reconnects."""
+"""CAN link over python-can, for the drivers: it survives failures of the bus, and reconnects."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from shared.config.sections import CanConfig
 from shared.exceptions import DriveError
 
 FRAMES_PER_READ: Final = 512
-"""More frames than a socket holds; a flooded bus must not hold up the loop."""
+"""Maximum number of frames per read, more than a socket holds: a flood must not delay the loop."""
 RETRY_MS: Final = 200
 """Time between two attempts to open the bus, ms: on socketcan an attempt may cost 1 ms."""
 COMMANDS_MS: Final = 40
 """Time after which a command that the bus has not accepted is dropped as outdated, ms."""
 ECHOING: Final = ("socketcan", "xrl_unix")
-"""Interfaces that hand own frames back once the bus has carried them."""
+"""Interfaces that return own frames once the bus has carried them."""
 ECHOED: Final = (Command.SET_INPUT_POS, Command.SET_INPUT_TORQUE, Command06.GET_VERSION)
-"""Commands to axis0 whose echo is awaited: each row that a driver sends has one of them."""
+"""Commands to axis0 whose echo is awaited; each packet of targets or torques contains one."""
 HEARD: Final = (
     Command.HEARTBEAT,
     Command.GET_ENCODER_ESTIMATES,
@@ -48,7 +48,7 @@ HEARD: Final = (
     Command.GET_VBUS,
     Command06.GET_TEMPERATURE,
 )
-"""Commands that the drive sends: they show that it is there, and pass the kernel's filter."""
+"""Messages that the drive sends; they show that it is on, and pass the kernel's filter."""
 IN_KERNEL: Final = ("socketcan",)
 """Interfaces whose frames all wait in the kernel, behind one file descriptor for `select`. The
 kernel drops other modules' frames before it wakes a process for them."""
@@ -73,16 +73,16 @@ def request_of(node_id: int, command: int) -> bytes:
 
 
 class CanLink:
-    """A bus that may be absent: its failures are counted, and read as silence.
+    """A bus that may be absent: its failures are counted, and look like silence.
 
-    A bus that fails, or whose controller has gone bus-off (too many errors on the wire), is closed,
-    and reopened with an attempt every `RETRY_MS`. No frame is sent that would have to wait for a
-    node to acknowledge it (`services.joint.drivers.bus_watch`).
+    If the bus fails, or its controller goes bus-off (too many errors on the wire), the link closes
+    it and tries to reopen it every `RETRY_MS`. It sends no frame that would have to wait for a node
+    to acknowledge it (`services.joint.drivers.bus_watch`).
 
     Attributes:
         watch: state of the bus.
         bus_offs: number of times that the controller went bus-off.
-        error_frames: number of reports of any other trouble on the wire.
+        error_frames: number of reports of other errors on the wire.
     """
 
     def __init__(self, config: CanConfig, node_ids: Sequence[int]) -> None:
@@ -114,7 +114,7 @@ class CanLink:
 
     @property
     def is_open(self) -> bool:
-        """True while there is a bus."""
+        """True while the bus is open."""
         return self._bus is not None
 
     def connect(self) -> bool:
@@ -151,16 +151,16 @@ class CanLink:
         return True
 
     def receive(self, timeout_s: float) -> list[Frame]:
-        """Return the frames of one wait; empty, too, if the bus failed, which closes it.
+        """Return the frames of one wait; empty if there are none, or if the bus failed.
 
-        Error frames are among them, for `error_frame`.
+        They include error frames, for `error_frame`.
         """
         frames = unpack_frames(self.receive_packet(timeout_s))
         self.take_in(frames, now_ns())
         return frames
 
     def receive_packet(self, timeout_s: float) -> bytes:
-        """As `receive`, but packed; `take_in` or `hear_drive` must follow."""
+        """Return frames as `receive` does, but packed; `take_in` or `hear_drive` must follow."""
         if self._commands:
             self._send_commands()
         try:
@@ -184,7 +184,7 @@ class CanLink:
         self._look_after(now)
 
     def hear_drive(self, now: int) -> None:
-        """As `take_in`, for frames that are all the drive's."""
+        """Do the same as `take_in`, for frames that all come from the drive."""
         if not self.watch.heard_in_order(now) or self._commands or self._greeting:
             self._look_after(now)
 
@@ -198,7 +198,7 @@ class CanLink:
     def send(self, packet: bytes, awaited: int = 0) -> bool:
         """Send frames; return False if the bus did not accept them all.
 
-        Frames that wait from `order` are sent first; nothing else is sent before them.
+        Frames from `order` that still wait are sent first; nothing else is sent before them.
 
         Args:
             packet: the frames.
@@ -206,14 +206,14 @@ class CanLink:
         """
         if self._commands and not self._send_commands():
             return False
-        # This covers a full queue, too. A dead link shows when receiving.
+        # False also covers a full queue; a dead link is detected when receiving.
         return self._hand_over(packet, awaited, now_ns()) == len(packet)
 
     def greet(self, packet: bytes) -> None:
         """Send the first requests on a newly opened bus.
 
-        They are sent before the drive was heard: their echoes show whether any node is there, and
-        whether frames of an earlier process wait. After an outage they wait for the drive.
+        They do not wait for a frame of the drive: their echoes show whether the bus has a node, and
+        whether frames of an earlier process wait. After an outage they wait until the drive sends.
         """
         if self.watch.unacknowledged:
             self._greeting = packet
@@ -222,15 +222,15 @@ class CanLink:
             self._send_probe(now_ns())
 
     def order(self, packet: bytes, *, proven: bool = False) -> None:
-        """Send frames in this order, and all of them.
+        """Send all frames, in this order.
 
-        A dozen frames can be more than the queue of the interface holds (ten frames, unless set).
-        The rest follows when there is room, within `COMMANDS_MS`. The frames replace a command that
-        is still waiting.
+        A dozen frames may exceed the queue of the interface (ten frames by default). The rest is
+        sent when there is room, within `COMMANDS_MS`. The frames replace a command that still
+        waits.
 
         Args:
             packet: the frames.
-            proven: send them only once the bus has just carried a frame: a delayed arming request
+            proven: send them only if the bus has just carried a frame, because a delayed request
                 would arm a drive at the wrong time.
         """
         if self._bus is None:
@@ -257,7 +257,7 @@ class CanLink:
         return not self._commands
 
     def _hand_over(self, packet: bytes, awaited: int, now: int) -> int:
-        """Send frames if they would not have to wait; return the bytes that the bus accepted."""
+        """Send frames if they need not wait; return the number of bytes that the bus accepted."""
         watch = self.watch
         if not watch.may_send(now):
             return 0
@@ -266,7 +266,7 @@ class CanLink:
             return taken
         if taken < len(packet):
             awaited = self._awaited(packet[:taken])
-            # a request that found no room shows nothing: it has no echo, and later frames show more
+            # a refused request proves nothing: it has no echo, and later frames prove more
             if not all(can_id & REMOTE_FLAG for can_id, _ in unpack_frames(packet[taken:])):
                 watch.refused(now)
         for _ in range(awaited):
@@ -283,7 +283,7 @@ class CanLink:
             self.watch.sent(now)
 
     def _look_after(self, now: int) -> None:
-        """Query what the bus has carried; restart, probe or greet it if that is due."""
+        """Query the frames that the bus has carried; restart, probe or greet it if that is due."""
         watch = self.watch
         if self._bus is None:
             return
@@ -301,7 +301,7 @@ class CanLink:
             self._send(greeting)
 
     def _restart(self) -> None:
-        """Discard what waits in the kernel and the adapter, of any process."""
+        """Discard the frames of any process that wait in the kernel and the adapter."""
         self._commands = b""
         done = True
         try:
@@ -316,7 +316,7 @@ class CanLink:
         self._retry_at_ns = now_ns() + RETRY_MS * NS_PER_MS
 
     def _disconnect(self) -> None:
-        """Close the bus, and drop what waited for it."""
+        """Close the bus, and drop a waiting command."""
         if self._bus is not None:
             with suppress(can.CanError, OSError):
                 self._bus.shutdown()
@@ -346,10 +346,10 @@ def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
 
 
 def receiver(bus: can.BusABC, *, in_kernel: bool) -> Receive:
-    """Return a function that waits once on a bus, then receives all frames that are there.
+    """Return a function that waits once on a bus, then receives all available frames.
 
-    A kernel bus is read at its socket: python-can creates an object for each frame, and waits by
-    the wall clock. On a silent bus, a clock that is set back (NTP) would hold up the loop.
+    A kernel bus is read at its socket, because python-can creates an object for each frame, and
+    waits by the wall clock. If NTP sets that clock back, a silent bus would block the loop.
     """
     if isinstance(bus, UnixCanBus):
         return bus.recv_packet

@@ -1,4 +1,4 @@
-"""Reports of an ODrive's two axes over CANSimple, of either firmware. Pure.
+"""Reports of an ODrive's two axes over CANSimple, for firmware 0.5 and 0.6. Pure.
 
 Firmware 0.5 and 0.6 share setpoints, gains, limits, estimates and the axis state in byte 4 of a
 heartbeat. They differ in the other bytes and in the error numbers. The firmware is detected, not
@@ -6,12 +6,12 @@ configured:
 
 - 0.6 answers a request for its version (0x000); on 0.5, the same frame feeds the watchdog.
 - Byte 7 of a heartbeat is reserved in 0.6; 0.5 sets its top bit while no trajectory runs.
-- Byte 5 is a flag in 0.5; a procedure result of 2 or more can only be 0.6.
+- Byte 5 is a flag in 0.5 and a procedure result in 0.6, so a value above 1 shows 0.6.
 - A drive that leaves `UNANSWERED` requests without an answer counts as 0.5. If it is 0.6 after all,
 its heartbeats look like errors, and its next answer corrects that.
 
-The opposite mistake would be dangerous: byte 5 of 0.6 says "busy" where 0.5 says that the motor
-failed. So a drive counts as 0.6 only on evidence.
+The opposite mistake would be dangerous: a byte 5 that means "busy" in 0.6 means in 0.5 that the
+motor failed. So a drive counts as 0.6 only on evidence.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ Dialect = Literal["", "0.5", "0.6"]
 HEARTBEAT_BYTES: Final = 8
 VERSION_BYTES: Final = 8
 UNANSWERED: Final = 10
-"""Number of version requests, one for each heartbeat that does not show the firmware: they are not
-all lost."""
+"""Number of unanswered version requests after which a drive counts as 0.5. One is sent for each
+heartbeat that does not show the firmware; it is unlikely that all of them are lost."""
 
 OTHER_ERROR: Final = 0x8000_0000
 """An error without a name in `AxisError`, or of a drive whose dialect is not known yet."""
@@ -67,10 +67,7 @@ _NAMED_06: Final = sum(error for error, _ in _FROM_06)
 
 
 def errors_from_06(errors: int) -> int:
-    """Return 0.6's errors as `AxisError` bits; without a counterpart, `OTHER_ERROR`.
-
-    Every error becomes at least one bit.
-    """
+    """Return 0.6's errors as `AxisError` bits; an error without a counterpart as `OTHER_ERROR`."""
     if not errors:
         return 0
     found = OTHER_ERROR if errors & ~_NAMED_06 else 0
@@ -81,7 +78,7 @@ def errors_from_06(errors: int) -> int:
 
 
 def dialect_of(heartbeat: bytes) -> Dialect:
-    """Return the dialect that a heartbeat is in; "" if both could have sent it."""
+    """Return the dialect of a heartbeat; "" if either firmware could have sent it."""
     if heartbeat[7]:
         return "0.5"
     return "0.6" if heartbeat[5] > 1 else ""
@@ -90,13 +87,13 @@ def dialect_of(heartbeat: bytes) -> Dialect:
 def judged(dialect: Dialect, heartbeat: bytes, *, wanted_armed: bool) -> tuple[int, int]:
     """Return an axis's state and its errors, `AxisError` bits and `OTHER_ERROR`.
 
-    Outside closed loop, if that was not requested, an expired watchdog only shows that nothing was
-    written yet. While the dialect is unknown, every possible error counts as an error.
+    If an axis is outside closed loop and was not requested to enter it, an expired watchdog is no
+    error: nothing has been written yet. While the dialect is unknown, every possible error counts.
 
     Args:
         dialect: the firmware's generation.
         heartbeat: its eight bytes.
-        wanted_armed: True if closed loop was requested, and IDLE not since.
+        wanted_armed: True if closed loop was requested, and IDLE has not been since.
     """
     state = heartbeat[4]
     closed = state == AxisState.CLOSED_LOOP_CONTROL
@@ -143,7 +140,7 @@ class AxesReport:
         return self._errors[0] | self._errors[1]
 
     def forget(self) -> None:
-        """Forget both axes until they have sent a heartbeat: the drive may be another one."""
+        """Forget both axes' reports, because the drive may be another one."""
         self.dialect = ""
         self._unanswered = 0
         self._discard_reports()
@@ -172,7 +169,7 @@ class AxesReport:
         self._judge()
 
     def receive_version(self) -> None:
-        """Process an answer to 0x000; earlier heartbeats are judged again if needed."""
+        """Process an answer to 0x000, and judge earlier heartbeats again if needed."""
         if self.dialect != "0.6":
             self._learn("0.6")
 

@@ -9,19 +9,19 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
 
 REBOOT_MS: Final = 500
-"""Silence after which the drive may have been power-cycled, ms: its earlier heartbeats are
-forgotten. The same holds for an axis that sends estimates and no heartbeats, because nothing else
+"""Silence after which the drive may have been power-cycled, ms, so its earlier heartbeats are
+forgotten. The same applies to an axis that sends estimates but no heartbeats, because nothing else
 would show that it disarmed."""
 ARM_GRACE_MS: Final = 10
 """Time after a command in which heartbeats may predate it and are ignored, ms."""
 FEED_MS: Final = 1000
 """Time after `arm` in which reading feeds the watchdogs until the drive is ARMED, ms. Only the next
-heartbeat shows that, and a watchdog may expire before it."""
+heartbeat shows ARMED, and a watchdog may expire earlier."""
 INSIST_MS: Final = 1000
-"""Time after `idle` in which an axis that still reports closed loop is commanded again, ms."""
+"""Time after `idle` in which an axis that still reports closed loop is idled again, ms."""
 PAIR_SHARE: Final = 0.6
-"""Fraction of the period beyond which an estimate belongs to the previous sample, as after a lost
-frame. More than half, so that axes out of step still make pairs."""
+"""Fraction of the period; if the other axis's estimate is older, it belongs to the previous sample,
+as after a lost frame. More than half, so that axes out of step still form pairs."""
 
 _REBOOT_NS: Final = REBOOT_MS * NS_PER_MS
 _BOTH: Final = 0b11
@@ -47,7 +47,7 @@ class EncoderPair:
         self.estimates[axis] = estimate
         came = self._came_ns
         if now_ns - came[1 - axis] > PAIR_SHARE * (now_ns - came[axis]):
-            # Without this, one lost frame would put one axis a period behind the other for good.
+            # Without this, one lost frame would keep one axis a period behind the other.
             self._fresh = 0
         came[axis] = now_ns
         self._fresh |= 1 << axis
@@ -74,9 +74,9 @@ class FrameTimes:
     """Arrival times of both axes' frames, ns.
 
     Attributes:
-        now_ns: of the frames being processed.
-        heard_ns: of the newest heartbeat of axis0, and of axis1.
-        sample_ns: of the newest sample of both axes; before the first, the start.
+        now_ns: time of the frames being processed.
+        heard_ns: time of the newest heartbeat of axis0, and of axis1.
+        sample_ns: time of the newest sample of both axes; initially the start time.
     """
 
     def __init__(self, lost_after_ns: int, now_ns: int) -> None:
@@ -88,10 +88,7 @@ class FrameTimes:
         self._lost_after_ns = lost_after_ns
 
     def sampled(self, now_ns: int) -> bool:
-        """Record a sample of both axes; return True if an axis sends no heartbeats.
-
-        Its last heartbeat is then older than a restart takes.
-        """
+        """Record a sample of both axes; return True if an axis sends no heartbeats."""
         self.sample_ns = now_ns
         self._has_sample = True
         first_ns, second_ns = self.heard_ns
@@ -99,11 +96,11 @@ class FrameTimes:
         return first_ns < restart_ns or second_ns < restart_ns
 
     def has_recent_sample(self, now_ns: int) -> bool:
-        """Return False if the drive is lost: it sent no sample for too long, or never."""
+        """Return False if the drive is lost: it has sent no sample for too long, or none at all."""
         return self._has_sample and now_ns - self.sample_ns <= self._lost_after_ns
 
     def may_have_restarted(self, now_ns: int) -> bool:
-        """Return True after a silence as long as a restart takes."""
+        """Return True after a silence of more than `REBOOT_MS`."""
         return now_ns - self.sample_ns > _REBOOT_NS
 
 
@@ -113,7 +110,7 @@ class OrderWindows:
     Attributes:
         believe_from_ns: heartbeats count from this time on.
         feed_until_ns: until then, reading feeds the watchdogs.
-        insist_until_ns: until then, an axis in closed loop has missed the idle command.
+        insist_until_ns: until then, an axis that is still in closed loop is idled again.
     """
 
     def __init__(self) -> None:

@@ -43,15 +43,15 @@ from shared.config.sections import CanConfig, DriveConfig
 from shared.exceptions import DriveError
 
 FRESH_S: Final = 0.05
-"""Time for which `set_position` waits for a frame of the drive, s: a silent one gets nothing."""
+"""Maximum time for which `set_position` waits for a silent drive, s; it never writes to one."""
 CLOSE_MS: Final = 20
-"""Time for which a command that the bus had no room for may delay `close`, ms."""
+"""Maximum time for which an unsent command may delay `close`, ms."""
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _LOST, _ARMED = DriveStatus.LOST, DriveStatus.ARMED
 _unpack_two_floats = struct.Struct("<ff").unpack_from
 _PAIR: Final = struct.Struct("<IB3xffIB3xff")
-"""The estimates of both axes in one packet: most of what a cycle receives."""
+"""Packet with the estimates of both axes, which most cycles receive."""
 _unpack_pair = _PAIR.unpack
 _PAIR_BYTES: Final = 8
 
@@ -60,11 +60,11 @@ class OdriveCan:
     """Both axes of one ODrive; implements `services.joint.drivers.base.Drive`.
 
     While the bus is absent, the status is LOST and `read` retries to open it. The status stays LOST
-    until both axes have sent a heartbeat, because only that shows their state. Frames lost on the
-    way to the drive are counted, not raised.
+    until both axes have sent a heartbeat, because only that shows their state. Torques and targets
+    that the bus does not accept are counted, and raise no error.
 
-    `DriveReading.error` holds `AxisError` bits for either firmware; errors of 0.6 map to the bit of
-    the same meaning, all others to `OTHER_ERROR`.
+    `DriveReading.error` holds `AxisError` bits for either firmware. An error of 0.6 maps to the bit
+    of the same meaning, or to `OTHER_ERROR` if there is none.
 
     Attributes:
         write_failures: torque pairs and targets that the bus did not accept.
@@ -94,7 +94,7 @@ class OdriveCan:
         self._drive = drive
         self._counts_per_turn = encoder_counts_per_turn
         self._rows = Rows(node_ids, drive)
-        # It feeds the firmware's watchdog; firmware 0.6 also answers with its version.
+        # Feeds the firmware's watchdog; firmware 0.6 also answers with its version.
         self._food = b"".join(packed(n, Command06.GET_VERSION, b"") for n in node_ids)
         self._pair_ids = tuple(
             cansimple.arbitration_id(n, Command.GET_ENCODER_ESTIMATES) for n in node_ids
@@ -180,8 +180,8 @@ class OdriveCan:
     def write(self, target: MotorTarget) -> None:
         """Send the target of both motors' own loops; gains before the values they act on.
 
-        A target that is not finite is not sent, so the drive keeps the last one. CAN carries
-        velocity and torque in thousandths: 0.035 N m at the joint.
+        An invalid target is not sent, so the drive keeps the last one. CAN carries velocity and
+        torque in thousandths: torque steps are 0.035 N m at the joint.
         """
         if not self._link.is_open or not is_target(target):
             self.write_failures += 1
@@ -195,9 +195,9 @@ class OdriveCan:
     def arm(self, *, onboard: bool) -> None:
         """Request closed loop control on both axes; see `Drive.arm`.
 
-        Errors are cleared, and `input_torque` and the gains are zeroed first: re-arming would
-        otherwise bring back the earlier torque, and the factory gains have an integrator. `status`
-        is IDLE until heartbeats show another state.
+        Errors are cleared and `input_torque` is zeroed first, and with `onboard` also the gains:
+        re-arming would otherwise bring back the earlier torque, and the factory gains have an
+        integrator. `status` is IDLE until heartbeats show another state.
         """
         self._send(odrive_frames.arming(self._drive, onboard=onboard), armed=True, proven=True)
         now = now_ns()
@@ -218,18 +218,18 @@ class OdriveCan:
         """Write both motors' positions, turns; see `Drive.set_position`.
 
         Raises:
-            DriveError: the firmware is unknown, the counts per turn are missing, or the bus is
-                full.
+            DriveError: the firmware is unknown, the counts per turn are missing, the position is
+                invalid, the drive is silent, or the bus is full.
         """
         frames = odrive_frames.positions(self._node_ids, turns, self.dialect, self._counts_per_turn)
-        if not self._link.watch.is_heard(now_ns()):  # a question to a person took time
+        if not self._link.watch.is_heard(now_ns()):  # the caller may have waited for a person
             self._pump(0.0)
             self._pump(FRESH_S)
         if not self._link.send(frames):
             first, second = self._node_ids
             raise DriveError(
-                f"CAN nodes {first} and {second}: the bus did not accept the command; check its "
-                "wiring, and whether its interface is up"
+                f"CAN nodes {first} and {second}: the drive is silent, or the bus did not accept "
+                "the command; check the drive's power, the wiring, and whether the interface is up"
             )
 
     def close(self) -> None:
@@ -253,7 +253,7 @@ class OdriveCan:
         self._link.order(odrive_frames.packet_of(self._node_ids, commands), proven=proven)
 
     def _pump(self, timeout_s: float) -> int:
-        """Process the frames of one wait; on a shared bus most are other modules'.
+        """Process the frames of one wait; on a shared bus most belong to other modules.
 
         Returns:
             time at which they were received, ns.
@@ -276,7 +276,7 @@ class OdriveCan:
         return now
 
     def _take_pair(self, packet: bytes, now: int) -> bool:
-        """Take the estimates of both axes; False if the packet is anything else."""
+        """Store the estimates of both axes; return False if the packet holds anything else."""
         id_0, bytes_0, pos_0, vel_0, id_1, bytes_1, pos_1, vel_1 = _unpack_pair(packet)
         if (id_0, id_1) != self._pair_ids or bytes_0 != _PAIR_BYTES or bytes_1 != _PAIR_BYTES:
             return False
@@ -323,7 +323,7 @@ class OdriveCan:
             self._report.receive_version()
 
     def _silence(self, now: int) -> DriveReading | None:
-        """Return None during a short silence, then a reading with the drive lost.
+        """Return None during a short silence, then a reading that reports the drive as lost.
 
         A failed link counts as silence too, because an interface that restarts is not a lost drive.
         """

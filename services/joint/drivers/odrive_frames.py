@@ -44,12 +44,12 @@ def packet_of(nodes: Nodes, commands: tuple[CanCommand, ...]) -> bytes:
 
 
 def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
-    """Return the commands to closed loop without torque, and without gains if onboard.
+    """Return the commands that start closed loop without torque, and without gains if onboard.
 
     Errors are cleared and `input_torque` is zeroed first: re-arming would otherwise bring back the
     earlier torque. In position mode the firmware itself sets input_pos to the present position; its
-    factory gains have an integrator, so they are zeroed too. In torque mode they stay: the firmware
-    limits the velocity with vel_gain, and a zero gain would suppress all torque.
+    factory gains have an integrator, so they are zeroed too. In torque mode they are kept, because
+    the firmware limits the velocity with vel_gain, and a zero gain would suppress all torque.
     """
     no_gains = (
         (Command.SET_VEL_GAINS, cansimple.pack_two_floats(0.0, 0.0)),
@@ -66,12 +66,12 @@ def arming(drive: DriveConfig, *, onboard: bool) -> tuple[CanCommand, ...]:
 
 
 class Rows:
-    """Packs the frames that are sent in every cycle or often.
+    """Packs the frames that are sent often.
 
-    An axis's gains come right before their target. Its stiffness is the product of both gains.
-    Where they change by much (DAMP), pos_gain falls and is sent first; otherwise the stiffness
-    would double in between. Setting a mode moves a 0.5 drive's input_pos to the motor's position,
-    so the axis's own target follows at once.
+    An axis's gains are sent right before its target. The stiffness is the product of both gains. In
+    DAMP, where they change by much, pos_gain falls and is sent first; otherwise the stiffness would
+    double in between. Setting a mode moves a 0.5 drive's input_pos to the motor's position, so the
+    axis's own target follows at once.
     """
 
     def __init__(self, nodes: Nodes, drive: DriveConfig) -> None:
@@ -92,7 +92,7 @@ class Rows:
     def torques(self, torque: Pair, *, settles: bool) -> bytes:
         """Pack torques, N m, clipped to `current_lim`; NaN becomes zero.
 
-        `settles`: include the limits and modes that arming has sent.
+        `settles`: True to include the limits and modes that arming has sent.
         """
         most, (id_0, id_1) = self._torque_max, self._torque_ids
         first, second = (
@@ -112,7 +112,7 @@ class Rows:
         """Pack a target, and the frames that are sent with it.
 
         After a full queue has cut off one axis, that axis is `first`, so it is not cut off again.
-        Velocity and torque are sent in thousandths: the torque to 0.035 N m at the joint.
+        Velocity and torque are sent in thousandths: torque steps are 0.035 N m at the joint.
         """
         second = 1 - first
         pos, vel, torque, ids = target.pos_turns, target.vel_turns, target.torque, self._input_ids
@@ -152,10 +152,14 @@ def positions(nodes: Nodes, turns: Pair, dialect: Dialect, counts_per_turn: int 
             f"{who}: no heartbeat has shown the firmware yet; wait until the drive reports a state"
         )
     if dialect == "0.5" and counts_per_turn is None:
-        raise DriveError(f"{who}: firmware 0.5 takes counts; give the encoder's counts per turn")
+        raise DriveError(
+            f"{who}: firmware 0.5 takes counts; set joint.encoder_counts_per_turn in the robot file"
+        )
     scale = counts_per_turn if dialect == "0.5" and counts_per_turn is not None else 1
     if not all(abs(turn * scale) < (1 << 31) - 1 for turn in turns):
-        raise DriveError(f"{who}: {turns[0]:g} and {turns[1]:g} turns do not fit into 32 bits")
+        raise DriveError(
+            f"{who}: {turns[0]:g} and {turns[1]:g} turns do not fit into 32 bits; give smaller ones"
+        )
     if dialect == "0.5":
         payloads = [cansimple.pack_i32(round(turn * scale)) for turn in turns]
     else:

@@ -1,13 +1,13 @@
 """One ODrive v3 over USB and the `odrive` package, unmodified (docs/drives.md).
 
-Threads: a service normally has one; this driver is the exception. The package runs its own asyncio
-loop in a thread (and libodrive a second one below it), and a transfer may take 0.5 s to fail. So
-every transfer runs on the package's loop. The control thread only takes the newest sample and
-leaves the newest target. Only references to frozen objects cross, each written by one side.
+Threads: unlike other drivers, this one has several. The package runs its own asyncio loop in a
+thread (and libodrive a second one below it), and a transfer may take 0.5 s to fail. So every
+transfer runs on the package's loop. The control thread only reads the newest sample and stores the
+newest target. The threads share only references to frozen objects, each written by one side.
 
 An exchange reads a sample, and at once writes the control thread's target for it: with a target one
-period late, the robot shook. There are at most 200 exchanges a second. Every four endpoints cost a
-round trip, so only changes are written, and the states are read less often. That suffices for the
+period late, the robot shook. Every four endpoints cost a round trip, so only changes are written,
+and the states are read less often. There are at most 200 exchanges a second, which suffices for the
 drives' own loops; use CAN for 1 kHz.
 """
 
@@ -40,34 +40,34 @@ EXCHANGE_HZ: Final = 200
 PATIENCE: Final = 1.5
 """Minimum wait of `read`, in exchange periods: with one period it would often miss the sample."""
 FEED_MS: Final = 1000
-"""Time after `arm` in which the watchdogs are fed without a target, ms: the control loop waits."""
+"""Time after `arm` in which watchdogs are fed without a target, ms: one is sent only once ARMED."""
 RETRY_S: Final = 0.2
 """Time between two attempts to connect, s."""
 STATES_EVERY: Final = 4
-"""Exchanges with an armed drive from one read of its states to the next: 20 ms."""
+"""Number of exchanges with an armed drive per read of its states: 20 ms."""
 COUNTS_EVERY: Final = 20
-"""Exchanges with a drive that is not armed from one read of its counts to the next: 100 ms."""
+"""Number of exchanges with a drive that is not armed per read of its counts: 100 ms."""
 ANSWER_S: Final = 0.003
-"""Time for which an exchange waits for the control thread's target after its sample, s."""
+"""Maximum time for which an exchange waits for the control thread's target after its sample, s."""
 REPORT_S: Final = 5.0
-"""Time after which a missing drive is reported, s: its serial number may be another drive's."""
+"""Time after which a missing drive is reported, s: the serial number may be wrong."""
 TURNS_MAX: Final = 1 << 13
 """Largest position, turns: at 18 bits per turn, an axis's count has 31 bits and a sign."""
 CLOSE_S: Final = 1.0
-"""Time for which `close` waits for a last request, s; not for the control path."""
+"""Maximum time for which `close` waits for a last request, s; not for the control path."""
 
 _ZERO = (0.0, 0.0)
 
 
 class _Request:
-    """Request of the control thread; its identity distinguishes it from an earlier one."""
+    """Request of the control thread; its identity distinguishes it from earlier requests."""
 
     def __init__(self, *, arm: bool = False, clear: bool = False) -> None:
         self.arm, self.clear = arm, clear
 
 
 class _Wanted:
-    """Newest target, request and position that the control thread left for the package's loop."""
+    """Newest target, request and position from the control thread for the package's loop."""
 
     def __init__(self) -> None:
         self.target: MotorTarget | None = None
@@ -99,7 +99,7 @@ def device_manager() -> DeviceManager:
         return get_device_manager(force_background_thread=True)
     except OSError as error:
         raise DriveError(
-            f"USB: {error}; the odrive package needs libusb-1.0, from {libusb_fix()}"
+            f"USB: {error}; the odrive package needs libusb-1.0; install it with {libusb_fix()}"
         ) from error
 
 
@@ -133,7 +133,7 @@ class OdriveUsb:
         self._torque_max = drive.current_lim * drive.torque_constant
         self._lost_after_s = drive.lost_after_s
         self._wanted = _Wanted()
-        self._silent_s = 0.0  # waited without a sample, except in a stopped process
+        self._silent_s = 0.0  # time waited without a sample, without pauses of the process
         # Written by the package's loop:
         self._sample = DriveReading(now_ns(), _ZERO, _ZERO, DriveStatus.LOST, 0)
         self._fresh = threading.Event()
@@ -168,14 +168,14 @@ class OdriveUsb:
         return msgspec.structs.replace(sample, status=DriveStatus.LOST, error=0)
 
     def write_torque(self, torque: Pair) -> None:
-        """Leave both motor torques, N m, for the next exchange, with the gains at zero."""
+        """Store both motor torques, N m, for the next exchange, with zero gains."""
         self.write(MotorTarget(self._sample.pos_turns, _ZERO, torque, _ZERO, _ZERO))
 
     def write(self, target: MotorTarget) -> None:
-        """Leave a target for the next exchange; the newest wins.
+        """Store a target for the next exchange; the newest wins.
 
-        The feedforward is clipped to `current_lim`. An invalid target is not sent, as over CAN, and
-        the drive keeps the last one: packing it would fail, which would end the connection.
+        The feedforward is clipped to `current_lim`. As over CAN, an invalid target is not sent, and
+        the drive keeps the last one. Packing it would fail and end the connection.
         """
         if not self._connected or not is_target(target):
             self.write_failures += 1
@@ -193,9 +193,9 @@ class OdriveUsb:
     def arm(self, *, onboard: bool) -> None:  # noqa: ARG002 - see below
         """Request closed loop on both axes; errors are cleared and the gains zeroed first.
 
-        Position mode serves `onboard` and plain torques: with zero gains it gives the same torque,
-        and torque mode would limit it by the present vel_gain. Like `idle`, the request is dropped
-        if the drive is lost first; the caller repeats it.
+        Position mode also serves plain torques: with zero gains it gives the requested torque,
+        whereas torque mode would limit it by the present vel_gain. Like `idle`, the request is
+        dropped if the drive is lost first; the caller repeats it.
         """
         self._wanted.request = _Request(arm=True)
 
@@ -215,7 +215,8 @@ class OdriveUsb:
         """
         if not self._connected:
             raise DriveError(
-                f"ODrive {self._serial_number}: the drive is lost; its position cannot be written"
+                f"ODrive {self._serial_number}: not connected, so its position cannot be written; "
+                "check its power and its USB cable"
             )
         if not all(abs(turn) < TURNS_MAX for turn in turns):
             raise DriveError(
@@ -245,8 +246,8 @@ class OdriveUsb:
                 if device is not None:
                     board = OdriveV3(device)
                     await board.read_settings()
-                    # What was left for an absent drive does not apply to this one: it may hold
-                    # the robot with its own loop, and an old target would be wrong.
+                    # Requests for an absent drive do not apply to this one: it may hold the robot
+                    # with its own loop, and an old target would be wrong.
                     self._done.request, self._wanted.position = self._wanted.request, None
                     self._done.target = self._wanted.target
                     self._done.status = DriveStatus.LOST
@@ -287,7 +288,7 @@ class OdriveUsb:
             log.get("xrl").warning("ODrive %s: %s", self._serial_number, trouble)
 
     async def _stay(self, board: OdriveV3) -> None:
-        """Exchange at the rate until closing, or until a transfer fails."""
+        """Exchange periodically, until closing or until a transfer fails."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         while not (self._wanted.closing and self._is_carried_out()):
@@ -304,10 +305,10 @@ class OdriveUsb:
         request, position = wanted.request, wanted.position
         new = request if request is not done.request else None
         if position is not None and (new is None or new.arm):
-            # Never while armed, or it jumps by as many turns. So arming waits for the next
+            # Never while armed, or the drive jumps by as many turns. So arming waits for the next
             # exchange, and so does the position if it comes with a request to go idle.
             await board.set_position(position)
-            if wanted.position is position:  # and no newer one
+            if wanted.position is position:  # there is no newer one
                 wanted.position = None
             request = done.request
         elif new is not None:
@@ -379,7 +380,7 @@ class OdriveUsb:
         elif request.arm:
             await board.arm(self._drive.vel_limit, self._drive.current_lim)
             done.feed_until_ns = now_ns() + FEED_MS * NS_PER_MS
-            done.target = self._wanted.target  # from before arming
+            done.target = self._wanted.target  # it is from before arming
         else:
             await board.idle()
             done.feed_until_ns = 0

@@ -1,4 +1,4 @@
-"""Part of an ODrive v3's property tree that the USB driver uses, and its registers' meaning."""
+"""Properties of an ODrive v3 that the USB driver uses, and the meaning of its registers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _THERMISTORS = ("motor.fet_thermistor.temperature", "motor.motor_thermistor.temp
 
 
 class AxesStatus:
-    """Judges both axes; an axis that was armed and left closed loop is an error."""
+    """Status of both axes; an armed axis that left closed loop is an error."""
 
     def __init__(self) -> None:
         """Start after a request to arm or idle: neither axis has been armed since."""
@@ -53,9 +53,10 @@ class AxesStatus:
 
     @staticmethod
     def errors(registers: Sequence[int], *, wanted_armed: bool) -> int:
-        """Return `AxisError` bits of (axis, motor, encoder, controller) of axis0, then axis1.
+        """Return the `AxisError` bits of both axes, or-ed.
 
-        An expired watchdog in IDLE only shows that nothing was written yet, and is not an error.
+        `registers` are those of axis, motor, encoder and controller of axis0, then of axis1. Unless
+        `wanted_armed`, an expired watchdog is no error: nothing has been written yet.
         """
         errors = 0
         for i in (0, 4):
@@ -69,7 +70,7 @@ class AxesStatus:
 class _EndpointBatch:
     """Endpoints of a drive that are read or written together, in order.
 
-    The package keeps four of its transfers in flight, so every four cost a round trip.
+    The package keeps four transfers in flight, so every four cost a round trip.
     """
 
     def __init__(self, device: Any, properties: Sequence[Any]) -> None:
@@ -79,17 +80,15 @@ class _EndpointBatch:
         self._codec = struct.Struct("<" + "".join(each.codec.struct_format for each in properties))
 
     async def read(self) -> tuple[Any, ...]:
-        """Read all values."""
         buffer = await self._device.read_endpoints(self._ids, self._sizes, transient=False)
         return self._codec.unpack(buffer)
 
     async def write(self, values: Sequence[float]) -> None:
-        """Write one value to each endpoint."""
         await self._device.write_endpoints(self._ids, self._sizes, self._codec.pack(*values))
 
 
 class TargetWriter:
-    """Writes the values of both motors' target that are new to the drive.
+    """Writes the values of both motors' targets that the drive does not have yet.
 
     Args:
         device: the package's `RuntimeDevice`.
@@ -108,7 +107,7 @@ class TargetWriter:
         self._written = None
 
     async def write(self, target: MotorTarget) -> None:
-        """Write the inputs, then the gains: an axis with new gains has its inputs already."""
+        """Write the inputs, then the gains, so that new gains act on new inputs."""
         values = values_of(target)
         written = self._written
         if written is None:
@@ -133,9 +132,8 @@ def values_of(target: MotorTarget) -> tuple[float, ...]:
     """Return a target's values in the order of `TargetWriter`.
 
     `input_vel` stays at zero, because four inputs take one round trip and six take two. The
-    velocity is sent in the position, `pos + vel / pos_gain`: the same target for the firmware's
-    law, its clamp included. Without a pos_gain it is sent in the torque. So the torque is the same,
-    also when writing stops.
+    velocity is sent in the position, `pos + vel / pos_gain`, or in the torque if pos_gain is 0.
+    The firmware's law and clamp then give the same torque, even when writing stops.
     """
     pos_0, torque_0 = _inputs_of(target, 0)
     pos_1, torque_1 = _inputs_of(target, 1)
@@ -154,7 +152,8 @@ def _inputs_of(target: MotorTarget, axis: int) -> tuple[float, float]:
 class OdriveV3:
     """A connected drive: its properties and functions, looked up once.
 
-    `device` is the package's `RuntimeDevice`; only `odrive_usb` imports the package.
+    `device` is a `RuntimeDevice` of the `odrive` package, which no other driver than `odrive_usb`
+    imports.
 
     Attributes:
         sample: position of both axes, then velocity.
@@ -187,19 +186,19 @@ class OdriveV3:
         self._watchdogs = _EndpointBatch(device, self._both(("config.enable_watchdog",)))
         self._counts_per_turn = _EndpointBatch(device, self._both(("encoder.config.cpr",)))
         self._food: list[Any] = []
-        # not in the tree of firmware before 0.5.2, which has it at the motor
+        # firmware before 0.5.2 has it at the motor
         self._directions: _EndpointBatch | None = None
         if all(f"{axis}.{_DIRECTION}" in device.properties for axis in _AXES):
             self._directions = _EndpointBatch(device, self._both((_DIRECTION,)))
         self._signs = (1, 1)
         self._counts = _EndpointBatch(device, self._both(_COUNTS))
-        # not in the tree of firmware before 0.5.2 either
+        # firmware before 0.5.2 lacks these, too
         self._heat: _EndpointBatch | None = None
         if all(f"{axis}.{name}" in device.properties for axis in _AXES for name in _THERMISTORS):
             self._heat = _EndpointBatch(device, self._both(_THERMISTORS))
 
     async def read_settings(self) -> None:
-        """Read saved settings: watchdogs, and the direction of the currents."""
+        """Read the saved settings of the watchdogs and of the currents' direction."""
         enabled = await self._watchdogs.read()
         self._food = [
             self.device.functions[f"{axis}.watchdog_feed"]
@@ -211,7 +210,7 @@ class OdriveV3:
             self._signs = (-1 if first < 0 else 1, -1 if second < 0 else 1)
 
     async def torques(self, torque_constant: float) -> Pair | None:
-        """Return the torques that both axes' own loops request, N m; None unless both are finite.
+        """Return the torques that both axes' own loops request, N m; None if one is not finite.
 
         A current's sign follows the direction that the encoder's calibration found, which depends
         on the phase wiring: the firmware inverts the torque where the direction is -1.
@@ -246,7 +245,7 @@ class OdriveV3:
             await self.device.call_function(food)
 
     async def set_position(self, turns: Pair) -> None:
-        """Write both encoders' reading, turns at the motor."""
+        """Set the readings of both encoders, turns at the motor."""
         counts_per_turn = await self._counts_per_turn.read()
         for axis, where, cpr in zip(_AXES, turns, counts_per_turn, strict=True):
             name = f"{axis}.encoder.set_linear_count"
@@ -257,7 +256,7 @@ class OdriveV3:
         await self.device.call_function("clear_errors")
 
     async def arm(self, vel_limit: float, current_lim: float) -> None:
-        """Command closed loop on both axes, without torque and gains; limits in turn/s and A."""
+        """Command closed loop on both axes, without torque or gains; limits in turn/s and A."""
         await self.clear_errors()
         modes = (ControlMode.POSITION, InputMode.PASSTHROUGH)
         await self._write_both(ARM_SETTINGS, (*modes, vel_limit, current_lim, *[0.0] * 5))

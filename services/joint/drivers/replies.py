@@ -1,7 +1,7 @@
 """Replies of an ODrive's two axes over CANSimple, such as counts and currents. Pure.
 
-Counts replace the estimates of firmware 0.5.6. It sends what its controller sees of the encoder:
-exactly 0, 0 from each start-up until the first closed loop, wherever the motor is.
+Counts replace the estimates of firmware 0.5.6, which are exactly 0, 0 from each start-up until the
+first closed loop, wherever the motor is.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Replies:
         ask_supply: request for the voltage of the supply.
         supply_v: the newest supply voltage, V; 0 if unknown.
         has_news: True after a reply that `encoder_zero` or `heat` may return.
-        counted: position in turns, without velocity, of an axis that sends no estimates; None
-            without a reply, or after estimates have arrived.
+        counted: for each axis, its position by the count, turns, with a velocity of 0; None without
+            a reply, or after real estimates have arrived.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Replies:
         return (a, b) if a is not None and b is not None else None
 
     def heat(self) -> tuple[Pair | None, Pair | None]:
-        """Return the thermistor readings of output stages and motors, C, once both axes replied."""
+        """Return the thermistor readings of output stages and motors, C, after both replies."""
         first, second = self._heat
         if first is None or second is None:
             return None, None
@@ -102,7 +102,7 @@ class Replies:
         self._torques[:] = None, None
 
     def take_count(self, axis: int, data: bytes) -> None:
-        """Store the count of axis 0 or 1; it shows no velocity."""
+        """Store the count of axis 0 or 1; a count shows no velocity."""
         if len(data) == _BYTES and self._counts_per_turn is not None:
             shadow_count, in_turn = cansimple.unpack_two_ints(data)
             self.counted[axis] = (shadow_count / self._counts_per_turn, 0.0)
@@ -118,10 +118,10 @@ class Replies:
                 self.supply_v = max(0.0, volts)
 
     def take_current(self, axis: int, data: bytes) -> None:
-        """Store the current setpoint of axis 0 or 1, unless it is not finite.
+        """Store the motor current that axis 0 or 1 requests, A, unless it is not finite.
 
-        Its sign is the torque's only where `encoder.config.direction` is 1. Firmware 0.5 does not
-        report that over CAN; `xrl doctor` reads it over USB.
+        Its sign is that of the torque only if `encoder.config.direction` is 1. Firmware 0.5 does
+        not report the direction over CAN; `xrl doctor` reads it over USB.
         """
         if len(data) == _BYTES:
             current, _ = cansimple.unpack_two_floats(data)

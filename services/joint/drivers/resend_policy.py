@@ -1,8 +1,8 @@
 """Decides when gains, limits and modes are sent to an ODrive on CAN with a target. Pure.
 
-Nothing shows whether a drive has received them, and a frame may be lost. A stiffness that should be
-off but is on adds to the torques computed without it (25 N m for 100 ms in a study). A limit of 2
-turn/s or torque mode would be felt too.
+A drive does not report whether it has received them, and a frame may be lost. A stiffness that is
+wrongly on adds to the torques computed without it (25 N m for 100 ms in a study). A drive that
+stays at the shipped limit of 2 turn/s, or in torque mode, would disturb the robot too.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from shared.bus.messages import Pair
 from shared.clock import NS_PER_MS
 
 GAINS_MS: Final = 100
-"""Gains are sent when they change, and with this period, ms."""
+"""Period at which unchanged gains are sent again, ms."""
 DRIFT_MS: Final = 10
-"""Gains that change are sent again with the next target. If they also changed within this time
-before, ms, they are sent again only after this time: drifting gains soon replace a lost frame, and
-the bus has other traffic."""
+"""Time after which drifting gains are sent again, ms. Changed gains are sent again with the next
+target, or only after this time if gains were also sent within it before the change: drifting gains
+soon replace a lost frame, and the bus has other traffic."""
 SETTLE_MS: Final = 1000
 """Time after `arm` in which limits and modes are sent every `GAINS_MS`, ms. A drive that is taken
-over gets none: firmware 0.5 disarms when a current limit falls below the present current."""
+over gets none, because firmware 0.5 disarms if the limit falls below the present current."""
 
 Gains = tuple[Pair, Pair]
 """Position gains 1/s and velocity gains N m s/turn, of both axes."""
@@ -68,7 +68,7 @@ class ResendPolicy:
         self._settle_until_ns = 0
 
     def with_target(self, gains: Gains, now_ns: int) -> GainRow:
-        """Return the gains to send with a target, and count them as sent."""
+        """Return the frames to send with a target, and count them as sent."""
         new = gains != self.gains
         due = new or now_ns >= self._gains_at_ns
         if due:

@@ -1,10 +1,10 @@
-"""A module's drive as the joint sees it: zero, motor signs, and read-only access.
+"""A module's drive, in motor turns from the joint's zero and with the motors' signs.
 
-The encoders are on the motors and count turns; a power cycle loses what a count means at the joint.
-So `xrl drive zero` writes the joint's position plus `mark_turns` to the drive: a motor at q = 0
-reads `mark_turns`. After a power cycle the drive reads near 0 instead, so a lost zero is detected
-within one cycle: the drive is `UNZEROED` and never armed, and an armed drive faults. A failed
-encoder keeps reporting its last position; the drive's error shows the failure.
+The encoders are on the motors, and the drive counts their turns from 0 after each power cycle. So
+`xrl drive zero` writes the joint's position plus `mark_turns` to the drive: a motor at q = 0 reads
+`mark_turns`. After a power cycle the drive reads near 0 instead, so a lost zero is detected within
+one cycle: the drive is `UNZEROED` and never armed, and an armed drive faults. A failed encoder
+keeps reporting its last position; the drive's error shows the failure.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class MotorFrame(NamedTuple):
     signs: Signs = (1, 1)
 
     def from_drive(self, reading: DriveReading) -> DriveReading:
-        """Return a reading in turns from the joint's zero; UNZEROED if the position is invalid.
+        """Return a reading in turns from the joint's zero; its status is UNZEROED without a zero.
 
-        A driver may return NumPy scalars. `float` converts them here: they are slow, may compute in
-        single precision, and no message may hold one.
+        A driver may return NumPy scalars, which are converted to `float` here: they are slow, may
+        compute in single precision, and must not be in a message.
         """
         mark, (sign_a, sign_b) = self
         (a, b), (vel_a, vel_b), torque = reading.pos_turns, reading.vel_turns, reading.torque
@@ -56,7 +56,7 @@ class MotorFrame(NamedTuple):
         )
 
     def target(self, target: MotorTarget) -> MotorTarget:
-        """Return a target as the drive counts it."""
+        """Return a target in the drive's counts and signs."""
         mark, (sign_a, sign_b) = self
         (a, b), (vel_a, vel_b) = target.pos_turns, target.vel_turns
         torque_a, torque_b = target.torque
@@ -69,7 +69,7 @@ class MotorFrame(NamedTuple):
         )
 
     def position(self, turns: Pair) -> Pair:
-        """Return motor turns from the joint's zero as the drive counts them."""
+        """Convert motor turns from the joint's zero to the drive's count."""
         mark, (sign_a, sign_b) = self
         return ((turns[0] + mark) * sign_a, (turns[1] + mark) * sign_b)
 
@@ -85,13 +85,12 @@ def _floats(pair: Pair | None) -> Pair | None:
 class WiredDrive:
     """A drive behind its motor frame; implements `Drive`.
 
-    With `read_only`, for bring-up and beside another controller, it sends nothing to the drive. An
-    armed drive then belongs to another controller and reads as IDLE. So the service stays DISARMED:
-    it publishes the joint's position and the drive's errors, and accepts no command.
+    With `read_only`, for bring-up and beside another controller, the drive gets no commands, only
+    requests for values. An armed drive then belongs to another controller and reads as IDLE. So the
+    service stays DISARMED and only publishes the joint's position and the drive's errors.
     """
 
     def __init__(self, drive: Drive, frame: MotorFrame, *, read_only: bool = False) -> None:
-        """Wrap a drive."""
         self._drive = drive
         self._frame = frame
         self._read_only = read_only
@@ -132,7 +131,7 @@ class WiredDrive:
             self._drive.idle()
 
     def set_position(self, turns: Pair) -> None:
-        """Write both motors' turns from the joint's zero: this zeroes them."""
+        """Zero both motors by writing their turns from the joint's zero."""
         if not self._read_only:
             self._drive.set_position(self._frame.position(turns))
 

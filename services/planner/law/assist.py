@@ -1,7 +1,7 @@
 """Forces at the harness: assist, easing of the lead, overload (docs/law.md#harness). Pure.
 
-The operator applies the wrench to the torso at the harness point; it is given in torso axes. The
-robot's upward force on the operator is minus the wrench's force along world z.
+The measured wrench is the operator's on the torso, at the harness point, in torso axes. The robot's
+upward force on the operator is the negative of the wrench's force along world z.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ ERROR_MIN: Final = 5.0
 """N; force that dry friction in the joints hides (0.3 N m per joint: 5 to 6 N at the harness).
 Within this band the force does not follow the assist, so an integral would hunt."""
 SETTLE_S: Final = 0.3
-"""s; delay of the integral after the request or the pose has changed."""
+"""s; the integral waits this long after a change of request or pose."""
 STILL_RATE_Z: Final = 0.02
-"""m/s of the COM; above it the operator is leading."""
+"""m/s of the COM, up or down; above it the operator is leading."""
 STILL_RATE_PITCH: Final = 0.05
-"""rad/s of the torso; above it the operator is leading."""
+"""rad/s of the torso's pitch; above it the operator is leading."""
 LEAD_MAX: Final = (150.0, 60.0)
-"""N and N m; largest lead that is amplified. A leading hand does not exceed it."""
+"""N and N m; maximum lead that is amplified. A leading hand stays below it."""
 LEAD_FADE_S: Final = 0.1
-"""s; the easing fades out over this time when the wrench is lost."""
+"""s; fade time of the easing when the wrench is lost or returns."""
 RELEASE_FRACTION: Final = 0.8
-"""Fraction of the overload limits, below which the harness counts as released."""
+"""Fraction of the overload limits below which the harness counts as released."""
 
 
 def force_up(force: Vector3, roll: float, pitch: float) -> float:
-    """Return a force's component along world z, N: the third row of R = Rz(yaw) Rx(roll) Ry(pitch).
+    """Return a force's component along world z, N, for R = Rz(yaw) Rx(roll) Ry(pitch).
 
     Args:
         force: N, torso axes.
@@ -84,27 +84,26 @@ class AssistState(msgspec.Struct):
 
 
 class AssistLaw:
-    """Assist force: the rate-limited request plus a slow integral on its error.
+    """Assist force: the rate-limited request plus a slow integral of the force error.
 
     assist = ramp + integral; while the request is constant and the pose is still
 
         d integral / dt = e / integral_s,  |integral| <= integral_max
 
-    with e = wanted - measured beyond `ERROR_MIN`. The ramp is limited to `force_max` (N) and
-    `rate_max` (N/s); an `integral_max` of 0 disables the integral.
+    with e the part of wanted - measured beyond `ERROR_MIN`. The ramp is limited to `force_max` (N)
+    and `rate_max` (N/s); an `integral_max` of 0 disables the integral.
 
     The integral is frozen without a reading (stale, invalid or saturated), in HOLD, while the
     request changes, and while the operator leads. The force of a leading hand is not an assist
-    error: its integral would outlast the lead and pull at the operator after the turn. Without a
-    request, the integral decays to zero with the same time constant. It never makes the assist
-    negative: the robot does not pull the operator down.
+    error: its integral would outlast the lead, and pull at the operator on the way up from a squat.
+    Without a request, the integral decays to zero with the same time constant. It never makes the
+    assist negative: the robot does not pull the operator down.
 
-    Stable in the loop with a hand of stiffness k and damping b, without delay, if integral_s is
-    above m / b - b / k for a robot of mass m (docs/law.md#harness).
+    For a hand of stiffness k and damping b and a robot of mass m, the loop without delay is stable
+    if integral_s > m / b - b / k.
     """
 
     def __init__(self, config: AssistConfig) -> None:
-        """Start without assist; the first `advance` adopts the request at once."""
         self._force_max, self._rate_max = config.force_max, config.rate_max
         self._integral_max, self._integral_s = config.integral_max, config.integral_s
 
@@ -155,20 +154,17 @@ class EasingState(msgspec.Struct):
     lead: Pair = (0.0, 0.0)
     """N and N m, within `LEAD_MAX`."""
     left: float = 0.0
-    """Fraction of the lead in use, 0 .. 1; it fades without a reading."""
+    """Fraction of the lead in use, 0 .. 1; fades out without a reading."""
 
 
 class LeadEasing:
-    """Amplifies the operator's lead: F_O += alpha S w_h (docs/law.md#harness).
+    """Amplifies the operator's lead by the force alpha S w_h (docs/law.md#harness).
 
-    w_h is the operator's wrench in the led directions: the upward force beyond the load that the
-    assist carries, f + assist, and the moment about the torso's pitch axis. Easing lowers the
-    robot's apparent mass from M to M / (1 + alpha). Like F_assist, its force acts through the
-    Jacobian of the harness point, not of the COM. It belongs in tau_coupled, which HOLD drops; in
-    tau_ff it would outlast the hand.
-
-    G is the hand's force over the robot's. The loop is stable if alpha |G(j w)| < 1 wherever G's
-    phase is -180 degrees: up to an alpha above 5 for the simulated hand (docs/law.md#harness).
+    w_h is the operator's wrench beyond the assist: the upward force, f + assist, and the moment
+    about the torso's pitch axis. Easing lowers the robot's apparent mass from M to M / (1 + alpha).
+    Like the assist, its force acts at the harness point, not at the COM. It is part of tau_coupled,
+    which HOLD drops; in tau_ff it would outlast the hand. For stable values of alpha, see
+    `lead_easing` in deploy/robot.toml.
     """
 
     def __init__(self, alpha: float) -> None:
@@ -219,7 +215,6 @@ class Overload:
     """
 
     def __init__(self, config: HarnessConfig) -> None:
-        """Set the limits: N, N m, ns, ns."""
         self._force_max, self._moment_max = config.overload_force, config.overload_moment
         self._after_ns = round(config.overload_after_ms * NS_PER_MS)
         self._release_ns = round(config.overload_release_s * NS_PER_S)

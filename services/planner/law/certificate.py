@@ -1,17 +1,19 @@
-"""Failsafe certificate: the local gains stand alone (docs/law.md#certificate). Pure.
+"""Failsafe certificate: the local gains alone hold the robot (docs/law.md#certificate). Pure.
 
-With the planner dead, tau = D (q_ref - q) + tau_ff, and both feet stay in place. T (12, 6) are the
-joint rates per unit of p along the closed chain: [J; C] T = [I; 0]. The stiffness along p is then
+Without the planner, tau = D (q_ref - q) + tau_ff, and both feet stay in place. T (12, 6) contains
+the joint rates per unit of p along the closed chain: [J; C] T = [I; 0]. The stiffness along p is
+then
 
     K_fail = sym(T^T D T) + K_geo,    K_geo = T^T H T,
-    H = d(J^T F_O + J_harness^T F_assist)/dq,
+    H = d(J^T F_O + J_harness^T (F_assist + F_load) up)/dq.
 
-K_geo is -d/dp of T^T (tau_ff - torque of gravity and load), with tau_ff held. The robot stands only
-if K_fail > 0. A margin is the smallest eigenvalue of K_fail, with every direction scaled by the
-required stiffness (`certificate.K_required`). 1 meets the requirement, 0 is a fall.
+K_geo is -d/dp of T^T (tau_ff - torque that balances weight and load), with constant tau_ff. The
+robot stands only if K_fail > 0. The margin is the smallest eigenvalue of K_fail, with each
+direction scaled by the required stiffness (`certificate.K_required`). At 1 the requirement is met;
+at 0 the robot falls.
 
-Tier 3: with its joint service dead too, each motor of a module holds with the mean of the two
-joints' stiffnesses (docs/drives.md). D is therefore averaged per module.
+Tier 3: without its joint service, each motor of a module holds with the mean of the two joints'
+stiffnesses (docs/drives.md). So D is averaged per module.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
 
 DIRECTIONS = ("lean forward", "lean sideways", "sink", "roll", "pitch", "yaw")
-"""Name of the motion along each part of p."""
+"""Name of the motion along each row of p."""
 UNITS = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
 
 
@@ -52,8 +54,8 @@ class Weakest(NamedTuple):
     required: float
     unit: str
     p: Array
-    """Direction (6,), m and rad. Times the square root of the required stiffness, its largest
-    element is 1."""
+    """Direction (6,), m and rad. Multiplied by the square root of the required stiffness, its
+    largest element is 1."""
 
 
 def motor_mean(D: Array) -> Array:
@@ -66,8 +68,9 @@ def motor_mean(D: Array) -> Array:
 def stiffness_graph() -> ca.Function:
     """Return the graph (T, H, D, scale) -> K_fail scaled (6, 12), K_fail (6, 6): docs/law.md (19).
 
-    Columns 0 to 5 of the first are tier 2, which holds with D. Columns 6 to 11 are tier 3, which
-    holds with each module's mean. The second is tier 2 in N/m, N/rad and N m/rad.
+    Columns 0 to 5 of the first result are for tier 2, which holds with D; columns 6 to 11 are for
+    tier 3, which holds with each module's mean. The second result is for tier 2, in N/m, N/rad and
+    N m/rad.
     """
     T, H = ca.MX.sym("T", N_JOINTS, 6), ca.MX.sym("H", N_JOINTS, N_JOINTS)
     D, scale = ca.MX.sym("D", N_JOINTS), ca.MX.sym("scale", 6)
@@ -91,7 +94,6 @@ class Certificate:
     """Certificate at one configuration; `at` sets the configuration."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Set the required stiffness."""
         self.K_required: Array = np.array(config.certificate.K_required)
         self._graph = CompiledGraph(_graph())
         self._T, self._hessian_O, self._D, self._scale = self._graph.arguments
@@ -103,14 +105,15 @@ class Certificate:
 
         Args:
             T: joint rates per unit of p along the closed chain (12, 6).
-            hessian_O: `Kinematics.hessian_times` of F_O and F_assist (12, 12), N m/rad.
+            hessian_O: `Kinematics.hessian_times` of F_O and the force at the harness (12, 12),
+                N m/rad.
         """
         self._T[:], self._hessian_O[:] = T, hessian_O
 
     def margins(self, D: Array) -> Margins:
         """Return the margins of local stiffnesses D (12,), N m/rad.
 
-        Zero where the closed chain has no finite rates: no gains are certified there.
+        Both are zero where the closed chain has no finite rates: no gains are certified there.
         """
         self._evaluate(D)
         K = self._K_scaled
@@ -140,6 +143,5 @@ class Certificate:
         return self._K_fail.copy()
 
     def _evaluate(self, D: Array) -> None:
-        """Compute `_K_scaled` and `_K_fail` of local stiffnesses D (12,), N m/rad."""
         self._D[:] = D
         self._graph()

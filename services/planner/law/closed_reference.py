@@ -10,21 +10,22 @@ from the middle to a limit and stays within `law.shift_max`:
 **Height and pitch.** Height and torso pitch are open: a hand leads them. The law closes both to
 lower the robot (`xrl down`, a low battery) or to raise it (`services.planner.watch.reserves`). The
 height reference h then moves at a bounded rate until a knee is at the end of its range; the pitch
-reference stays constant. When nobody leads (`services.planner.watch.unattended`), the law closes
-one or both where they are. The references start at the measured pose, and h at the measured rate,
-so nothing steps. z is the measured height.
+reference stays constant. The law also closes a direction that nobody leads
+(`services.planner.watch.unattended`), and both if the robot parks. The references start at the
+measured pose, and h at the measured rate, so nothing steps. z is the measured height.
 
-    p_ref    = (1 - hold) p_ref    + hold (h, pitch)             hold: of the height, of the pitch
+    p_ref    = (1 - hold) p_ref    + hold (h, pitch)             hold: for height, for pitch
     pdot_ref = (1 - hold) pdot_ref + hold (h', 0)
-    |h'| <= RATE_MAX,  |h''| <= ACCELERATION,  |h' | <= APPROACH (distance of the knee from its end)
-    |h - z| <= lead: a joint service accepts no more, and a hand that holds the robot stops it
-    F_lift'  = FORCE_RATE (h - z) / lead,   0 <= F_lift <= FORCE_MAX, upwards only
+    |h'| <= RATE_MAX,  |h'| <= APPROACH (distance of the knee from its end)
+    |h''| <= ACCELERATION;  STOPPING for a height that is closed in place
+    |h - z| <= lead: a joint service accepts no more, and a hand can stop the robot
+    F_lift'  = FORCE_RATE (h - z) / lead,   0 <= F_lift <= FORCE_MAX, while toward is UP or REST
     M'       = MOMENT_GAIN (pitch_ref - pitch), |M| <= MOMENT_MAX, while nobody leads the pitch
 
 The local gains are soft along pitch (30 N m/rad are required), so M holds a torso that the robot
-file describes wrongly. M starts from the moment that the torso's acceleration shows. F_lift
-overcomes a hand that presses on a rising robot. It acts at the COM: at the harness, ahead of the
-pitch axis, it would turn a torso that nobody holds.
+file describes wrongly. M starts from the torso's acceleration at its release. F_lift overcomes a
+hand that presses on a rising robot. It acts at the COM: at the harness, ahead of the pitch axis, it
+would turn a torso that nobody holds.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from shared.clamp import clamp
 ROWS: Final = (0, 1, 3, 5)
 """Rows of p that the shift moves: x, y, roll, yaw."""
 SHIFT_S: Final = 1.0
-"""Shortest time from the middle to the end of the range, s."""
+"""Minimum time from the middle to the end of the range, s."""
 OMEGA: Final = 6.0
 """w, rad/s; the follower is critically damped."""
 
@@ -54,7 +55,7 @@ class ShiftState(msgspec.Struct):
     rate: list[float] = msgspec.field(default_factory=lambda: [0.0] * len(ROWS))
 
     def stop(self) -> None:
-        """Stop at the current shift while the planner is not engaged."""
+        """Stop at the current shift, because the planner is not engaged."""
         self.rate = [0.0] * len(ROWS)
 
     def add_to(self, p: Array, pdot: Array) -> None:
@@ -71,7 +72,6 @@ class ShiftReference:
     """
 
     def __init__(self, shift_max: Sequence[float]) -> None:
-        """Set the largest shift each way: m, m, rad, rad."""
         self._shift_max = tuple(shift_max)
 
     def advance(self, s: ShiftState, wanted: Vector4, dt: float) -> None:
@@ -91,53 +91,54 @@ class ShiftReference:
 
 
 class Toward(IntEnum):
-    """Direction in which the robot moves on its own."""
+    """Direction in which the robot moves on its own, or PERSON."""
 
     DOWN = -1
     REST = 0
     """Stay at the current height and pitch."""
     UP = 1
     PERSON = 2
-    """No motion of its own: the person leads height and pitch."""
+    """The person leads height and pitch."""
 
 
 RATE_MAX: Final = 0.05
-"""m/s; from the deepest squat to straight legs in 6 s."""
+"""m/s; the robot rises from the deepest squat to straight legs in 6 s."""
 ACCELERATION: Final = 0.1
 """m/s^2"""
 STOPPING: Final = 1.0
-"""m/s^2; deceleration of a height that nobody leads: from 0.16 m/s within 13 mm."""
+"""m/s^2; deceleration of a height that nobody leads. It stops from 0.16 m/s within 13 mm."""
 APPROACH: Final = 0.2
-"""m/s per rad from the end of the knee's range: the last centimetres take seconds."""
+"""m/s per rad between the knee and the end of its range; the last centimetres take seconds."""
 HOLD_S: Final = 0.5
-"""Fade time of the hold of height and pitch, in and out, s."""
+"""Time to close or to open height and pitch, s."""
 RELEASED_S: Final = 0.1
-"""Fade time for a direction that nobody leads, s; a torso gains up to 0.35 rad/s meanwhile."""
+"""Time to close a direction that nobody leads, s; meanwhile a torso gains up to 0.35 rad/s."""
 LEAD_MAX: Final = 0.012
-"""m; across the local springs this equals 65 N of a hand, beyond the estimated load."""
+"""m; maximum |h - z|. Deflected by this, the local springs balance a hand's force of 65 N beyond
+the estimated load."""
 LEAD_ANGLE: Final = 0.08
-"""rad; maximum lead of a joint's reference. Half of the limit that trips, and of the one in a joint
-service (`trips.tracking`, `envelope.q_ref_distance`)."""
+"""rad; maximum distance of a joint from its reference, about half of its limits in the trips and in
+the joint service (`trips.tracking`, `envelope.q_ref_distance`)."""
 LEAD_PITCH: Final = 0.12
-"""rad"""
+"""rad; maximum |pitch_ref - pitch|."""
 FORCE_RATE: Final = 60.0
-"""N/s at the maximum lead."""
+"""N/s; rate of F_lift at the maximum |h - z|."""
 FORCE_MAX: Final = 200.0
-"""N beyond the assist; a leading hand presses with at most 150 N. With full assist, the force stays
-below a harness overload (500 N)."""
+"""N beyond the assist; a leading hand presses with at most 150 N. Together with the full assist, it
+stays below a harness overload (500 N)."""
 FADE_RATE: Final = 30.0
-"""N/s; the force fades at this rate once the robot stops rising."""
+"""N/s; F_lift fades at this rate once the person leads again or the robot goes down."""
 MOMENT_GAIN: Final = 80.0
 """N m/s per rad; with 200 a released torso swayed by 0.04 rad at 1 Hz."""
 MOMENT_FIRST: Final = 8.0
-"""N m; maximum at the release, a step of 4 N m at each hip."""
+"""N m; maximum of M's first value: a step of 4 N m at each hip."""
 MOMENT_MAX: Final = 30.0
 """N m; `law.load_correction` accepts 20, and 25 N of a person at the harness add 7."""
 MOMENT_FADE_RATE: Final = 30.0
-"""N m/s; the moment fades at this rate once a hand leads the pitch."""
+"""N m/s; M fades at this rate once a hand leads the pitch, or the robot moves on its own."""
 _ROWS: Final = (2, 4)
 
-# Compared in each tick: docs/contributing.md, The control path.
+# Constants, because each tick compares them (docs/contributing.md, The control path).
 _DOWN, _UP, _PERSON = Toward.DOWN, Toward.UP, Toward.PERSON
 
 
@@ -155,15 +156,15 @@ class HeightState(msgspec.Struct, array_like=True):
     pitch: float = 0.0
     """rad"""
     hold: Pair = (0.0, 0.0)
-    """Weight of the closed height and pitch, 0 .. 1; at 0 the person leads."""
+    """Fractions by which height and pitch are closed, 0 .. 1; at 0 the person leads."""
     fade_s: float = HOLD_S
-    """Fade time of the hold, s."""
+    """Time in which `hold` changes from 0 to 1, s."""
     force: float = 0.0
     """F_lift, N, upwards at the COM."""
     moment: float = 0.0
     """M, N m, about the torso's pitch."""
     T_z: float = 0.0
-    """Largest joint rate per unit of the height at the last reference, rad/m."""
+    """Largest |dq/dz| at the last reference, rad/m."""
 
     @property
     def is_active(self) -> bool:
@@ -207,8 +208,8 @@ class HeightReference:
         Args:
             s: state of the closed directions; updated in place.
             toward: direction in which the robot moves on its own.
-            released: (height, pitch) that nobody leads; closed where they are, unless the robot
-                moves on its own.
+            released: (height, pitch), each True while nobody leads it; such a direction is closed
+                in place, unless the robot moves on its own.
             drive: moment that turned the torso when its pitch was released, N m.
             p: measured pose (6,), m and rad.
             pdot: its rate (6,).

@@ -1,18 +1,18 @@
 """The coupled torque, and all of the law's terms at a reference pose. Pure.
 
-The planner adds the coupled torque, low-passed, to the local gains. Alone, the local gains stand
-with K_fail = T^T D T + K_geo (`services.planner.law.certificate`) and damp with T^T D_B T. In the
-closed rows of p, the rest of the body's K_p and B_p (paper, section IV) is
+The planner adds the coupled torque, low-passed, to the local law. Along p, the local gains have the
+stiffness K_fail = T^T D T + K_geo (`services.planner.law.certificate`) and the damping T^T D_B T.
+In the closed rows of p, they lack this part of the body's K_p and B_p (paper, section IV):
 
     K_c = (K_p - K_fail)+        B_c = (c B_p - T^T D_B T)+        c: `coupling_damping`
 
-(.)+ keeps the positive part: the planner only ever adds stiffness and damping. It requests
+(.)+ is the positive part: the planner adds stiffness and damping, but never removes any. It
+requests
 
     tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot) + F_I] }
 
-through two poles at `coupling_bandwidth_hz`. The feedback is some milliseconds old and acts on the
-bare rotors of a flexible drivetrain. Without the filter, the robot shook below 40 000 N m/rad and
-fell. `tools.lab.design.dynamic_certificate` computes which bandwidth and damping are safe.
+through two poles at `coupling_bandwidth_hz`. `tools.lab.design.dynamic_certificate` shows which
+bandwidth and damping are safe on flexible joints (docs/law.md#flexible-joints).
 
 `LawAtReference` computes local gains and coupled torque at a pose (paper, section IV), for the
 planner's tick and for `xrl log explain` (`tools.lab.design.torque_breakdown`).
@@ -36,12 +36,12 @@ from shared.config.sections import LawConfig
 from shared.joints import N_JOINTS
 
 Y = 1
-"""Row of p."""
+"""Row of y in p."""
 FAST = 0.04
 """m/s; the integral ignores an error that changes faster, as in a shove and the sway after it. With
 the whole error, a shoved robot swung to the other side twice as far as without an integral."""
 GAIN_MIN = 1e-9
-"""Smallest gain of the body; smaller ones count as zero."""
+"""Smaller gains of the body count as zero."""
 
 
 class UncoupledGains:
@@ -63,7 +63,7 @@ class UncoupledGains:
         self._damping = _scaled(damping * B_p[closed])
 
     def at(self, K_fail: Array, B_local: Array) -> tuple[Array, Array]:
-        """Return K_c and B_c (6, 6), symmetric and not negative: docs/law.md (16).
+        """Return K_c and B_c (6, 6), symmetric and positive semidefinite: docs/law.md (16).
 
         Zero where the closed chain has no finite rates: nothing can be added there.
 
@@ -97,13 +97,13 @@ def pole_gain(bandwidth_hz: float, dt: float) -> float:
 class PushIntegral:
     """F_I: force along y that grows against a lasting push, until the error is gone.
 
-    The coupled torque then bears a push from the side, and its load sharing demands little of each
-    sole. The local springs alone would shift the feet's shares until a sole tips:
-
         F_I' = (1 - |e_y'| / FAST)+ K_p e_y / push_integral_s,    |F_I| <= push_integral_max
 
-    HOLD drops F_I with the coupled torque, so `push_integral_max` is a push that HOLD withstands.
-    There is no integral along x, because HOLD has no such reserve there.
+    The legs share F_I, so that it balances a push from the side with little moment at each sole.
+    The local springs alone would need more moment, and a sole could tip.
+
+    HOLD drops F_I with the coupled torque, so HOLD must withstand a push of `push_integral_max`.
+    Along x it has no such reserve, so there is no integral along x.
 
     Attributes:
         gain: rate of the force per error, N/(m s); 0 if y is led or the split is the paper's.
@@ -111,7 +111,6 @@ class PushIntegral:
     """
 
     def __init__(self, law: LawConfig) -> None:
-        """Set rate and maximum."""
         closed = law.split == "certified" and not law.S[Y]
         self.gain = law.K_p[Y] / law.push_integral_s if closed else 0.0
         self.most = law.push_integral_max if closed else 0.0
@@ -161,18 +160,17 @@ class _LawTerms(NamedTuple):
     """One tick's gains, and its coupled torque before any filter."""
 
     body_gains: Callable[[], JointGains]
-    """Computes K_q and B_q of the whole body; the certified split does not need them."""
+    """Computes K_q and B_q of the whole body, if the split needs them."""
     local: LocalGains
-    """D and D_B, certified."""
+    """D and D_B, with their margins."""
     coupled: Array
-    """J^T [K_c e_p + B_c e_pdot] (12,), N m, which the planner adds to the local gains."""
+    """J^T [K_c e_p + B_c e_pdot] (12,), N m, which the planner adds to the local law."""
 
 
 class LawAtReference:
     """The law's terms at a pose, without state."""
 
     def __init__(self, gains: GainLaw, split: GainSplit) -> None:
-        """Set the body's gains and how they are split."""
         self._gains, self._split = gains, split
         self._uncoupled = UncoupledGains(gains.K_p, gains.B_p, gains.S, split.coupling.damping)
 

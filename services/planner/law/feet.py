@@ -1,19 +1,18 @@
 """Stance of the feet, slope of the floor, and loads of the soles. Pure.
 
 **Stance**, relative to the robot file. The law locates the feet from the joint angles alone. Both
-legs carry the same torso, so two estimates of one torso show a foot that is ahead, turned, or
-closer than `geometry.w_base`. Before the planner engages, it adopts the stance in which the legs
-agree, and keeps it while engaged. The legs then do not work against each other, and each foot gets
-a wrench that suits its position. With the file's stance, feet 0.1 m too wide tipped a sole by 0.18
-rad; with the measured stance, by 0.002 rad.
+legs carry the same torso, so a difference between their estimates of it shows a foot that is ahead,
+turned, or closer than `geometry.w_base`. Before the planner engages, it adopts the stance in which
+the legs agree, and keeps it while engaged. The legs then do not work against each other, and each
+foot gets a wrench that suits its position.
 
-While the planner is not engaged, the stance follows the joints slowly. It then finds feet that were
-moved in HOLD, and ignores a sole that lifts briefly in a sway. A planner that has never engaged
-cannot tell the two apart. If it starts while a push tips the soles, it keeps that stance until it
-disengages.
+Until its first lead, a planner adopts the stance at once. If a push tips the soles just then, it
+keeps that wrong stance until it disengages. In later holds, the stance follows the joints slowly.
+So it follows feet that were moved in HOLD, and ignores a sole that lifts briefly in a sway.
 
-Zero errors of the joints look like slightly displaced feet, so they become part of the stance. The
-planner refuses a stance beyond `law.stance_max`: it is not shown to stand, or something is broken.
+Errors in the joints' zeros look like slightly displaced feet, so they become part of the stance.
+The planner refuses a stance beyond `law.stance_max`: no study shows that the robot stands there,
+and a sensor may be broken.
 
 **Slope**, from IMU and joints, as the direction of up in floor axes. The planner's axes are the
 floor's: z is the floor's normal (docs/law.md#slopes). On a slope, gravity leans in these axes by
@@ -24,18 +23,18 @@ The IMU measures up in torso axes; the joints give the torso's orientation on th
 
     up_floor = R_torso(q) up_torso,        low-passed by one pole of `imu.levelling_s`
 
-Zero errors of the ankles turn R_torso and thus up_floor, but the law still keeps the COM above the
-ankles. Zero errors of knees and hips turn it too, and matter only with an IMU: half a degree at
-both hips moves the COM by 8 mm.
+Errors in the ankles' zeros turn R_torso and thus up_floor, but the law still keeps the COM above
+the ankles. Errors in the zeros of knees and hips also turn R_torso, and matter only with an IMU:
+half a degree at both hips moves the COM by 8 mm.
 
 q lacks the deflection of flexible joints, so a sway looks like a tilting floor. The filter is
-therefore slow. The last slope stays if the IMU drops out, because a floor does not jump. A planner
-that never received an attitude assumes a level floor. If the first one arrives while the planner is
-engaged, the filter starts from level.
+therefore slow. The planner keeps the last slope if the IMU drops out, because a floor does not
+jump. A planner that never received an attitude assumes a level floor. If the first attitude arrives
+while the planner is engaged, the filter starts from level.
 
-**Soles**, from the joint torques. A sole tips when its centre of pressure reaches its edge. A led
-robot is soft against that: it fell when leaned on from the side with 50 N or more. HOLD is
-stiffer: it withstands 65 N or more if it starts while both soles are flat.
+**Soles**, from the joint torques. A sole tips when its centre of pressure reaches its edge. HOLD
+withstands a harder push from the side than the led robot (docs/results.md), so the planner trips
+before a sole tips.
 """
 
 from __future__ import annotations
@@ -61,12 +60,12 @@ _ROWS: Final = (
     ("pitched toes down relative to", "pitched toes up relative to", "deg"),
     ("turned inwards relative to", "turned outwards relative to", "deg"),
 )
-"""Right foot relative to the left: text for a positive and for a negative row of a stance, and
-the unit."""
+"""Right foot relative to the left: texts for a positive and a negative value of each row of a
+stance, and the unit."""
 _TO_UNIT: Final = {"mm": 1e3, "deg": 180.0 / math.pi}
 
 FOLLOW_S: Final = 2.0
-"""s; time constant with which a planner that was engaged before follows a new stance."""
+"""s; time constant with which a planner that has led before follows a new stance."""
 FOLLOW_TOLERANCE: Final = 0.03
 """m or rad; the planner does not engage while adopted and measured stance differ by more."""
 
@@ -75,11 +74,11 @@ class StanceState(msgspec.Struct):
     """State of `Stance`."""
 
     taken: Vector6 = AS_CONFIGURED
-    """Adopted stance of the right foot relative to the left, as deviation from the robot file:
-    x, y, z in m and a rotation vector in rad, world axes."""
+    """Adopted stance of the right foot relative to the left, as a deviation from the robot file: x,
+    y, z in m and a rotation vector in rad, world axes."""
     refusal: str = ""
-    """Reason for refusing the last measured stance: it exceeds the limits, or the feet have moved
-    and their new stance is not adopted yet. "" if it is accepted."""
+    """Reason for refusing the last measured stance: it is beyond the limits, or not adopted yet. ""
+    if it is accepted."""
 
 
 class Stance:
@@ -89,25 +88,26 @@ class Stance:
         """Set the limits.
 
         Args:
-            stance_max: `law.stance_max`, m and rad; a zero row is neither adopted nor refused.
+            stance_max: `law.stance_max`, m and rad; a row with limit 0 is neither adopted nor
+                refused.
         """
         self._stance_max: Array = np.array(stance_max)
 
     def advance(self, s: StanceState, measured: Array, fraction: float = 1.0) -> None:
-        """Adopt the stance in which the legs agree now.
+        """Move the adopted stance towards the measured one, in which the legs agree now.
 
         Args:
             s: the stance; updated in place.
             measured: measured stance (6,), m and rad.
             fraction: step towards it, as a fraction; 1 adopts it at once.
         """
-        if not np.isfinite(measured).all():  # nothing to follow
+        if not np.isfinite(measured).all():
             s.refusal = "the joint angles give no stance: check the encoders"
             return
         checked, taken = self._stance_max > 0.0, np.array(s.taken)
         beyond = bool((checked & (np.abs(measured) > self._stance_max)).any())
         wanted = np.where(checked, measured, 0.0)
-        if not beyond:  # a refused stance is not followed: it may be a broken encoder
+        if not beyond:  # a refused stance is not followed: an encoder may be broken
             taken += fraction * (wanted - taken)
             s.taken = vector6(taken)
         moved = bool((np.abs(wanted - taken) > FOLLOW_TOLERANCE).any())
@@ -144,7 +144,6 @@ class Levelling:
     """Low-passed slope of the floor."""
 
     def __init__(self, levelling_s: float) -> None:
-        """Set the time constant, s."""
         self._levelling_s = levelling_s
 
     def advance(
@@ -184,7 +183,7 @@ def up_of(slope: Pair) -> Vector3:
 
 
 def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
-    """Return the floor's rise along x and y, rad; (pi, pi) if the torso is upside down.
+    """Return the floor's rise along x and y, rad; (pi, pi) if it seems vertical or upside down.
 
     Args:
         up_torso: unit vector against gravity, torso axes.
@@ -204,11 +203,11 @@ def slope_of(up_torso: Vector3, roll: float, pitch: float, yaw: float) -> Pair:
 ANKLES = tuple(2 * MODULE_INDEX[f"ankle_{side}"] for side in SIDES)
 """Indices of the ankles' phi among the joints."""
 LOAD_MIN = 50.0
-"""N; `Soles.edge` raises a smaller load to this, and `Soles.tipping` ignores its sole."""
+"""N; for a smaller load, `Soles.edge` uses this value, and `Soles.tipping` ignores the sole."""
 
 
 class Soles:
-    """Loads of the right and the left sole."""
+    """Loads of the right and the left sole, and the offsets of their centres of pressure."""
 
     def __init__(self, config: RobotConfig) -> None:
         self._half_width = 0.5 * config.geometry.w_foot
@@ -228,7 +227,7 @@ class Soles:
         return right + self._leg_weight, left + self._leg_weight
 
     def edge(self, tau: Array, loads: Pair) -> float:
-        """Return the soles' larger lateral offset of pressure: 0 below the ankle, 1 at the edge.
+        """Return the larger lateral pressure offset of the soles: 0 below the ankle, 1 at an edge.
 
         An unknown load counts as half of the weight.
 
@@ -243,7 +242,7 @@ class Soles:
         return out / self._half_width
 
     def tipping(self, tau: Array, loads: Pair) -> float:
-        """Return the soles' larger offset of pressure in any direction: 1 at edge, toe or heel.
+        """Return the largest pressure offset of the soles, across or along: 1 at edge, toe or heel.
 
         A sole whose load is unknown or below `LOAD_MIN` counts as 0.
 

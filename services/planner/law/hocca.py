@@ -7,12 +7,14 @@ One tick, in the paper's letters:
     q_ref = IK(p_ref)
     v_ref                J v_ref = S J v + S_perp pdot_C, C v_ref = 0
     F     = K_p (p_ref - p) + B_p (pdot_ref - pdot) + F_O
+    F_O                  weight m g up, pitch moment of the load beyond the robot file, and the lift
+                         and moment that hold a closed height or pitch
     T                    [J; C] T = [I; 0] at q_ref, so v_ref = T (S J v + S_perp pdot_C)
     K_q, B_q             at q_ref
-    D, D_B               local gains that the joint services hold: schedule and certificate
+    D, D_B               local gains of the joint services, from schedule and certificate
     K_c, B_c             the part of K_p and B_p that D and D_B lack
-    tau_ff  = J^T (m g up) + J_harness^T (F_assist + F_load) up
-    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot) + F_I] }
+    tau_ff  = J^T F_O + J_harness^T (F_assist + F_load) up
+    tau_coupled = low-pass { J^T [K_c (p_ref - p) + B_c (pdot_ref - pdot) + F_I] } + eased lead
 
 Pure: no clock, bus or thread.
 """
@@ -61,7 +63,7 @@ from shared.joints import MODULE_INDEX, N_JOINTS, SIDES
 
 RECENTRED = np.array([True, True, False, True, False, True])
 """Rows of p whose closed-loop reference returns to zero: roll, yaw, and the COM's offset from the
-ankles along gravity. On a slope, the COM is off the floor's normal through the ankles by height
+vertical through the ankles. On a slope, the vertical differs from the floor's normal by height
 times slope."""
 
 _PERSON: Final = Toward.PERSON
@@ -82,25 +84,25 @@ class LawInputs(NamedTuple):
     dt: float
     """Time since the last tick, s."""
     assist: float = 0.0
-    """Assist that the operator requests, N. The law limits its rate, except in the first tick,
-    which takes over the assist that HOLD carries."""
+    """Requested assist, N. The law limits its rate, except in the first tick, because HOLD may
+    already carry it."""
     shed_rate: float = 0.0
     """Maximum rate at which the assist falls, N/s, if above the law's own limit."""
     shift: Vector4 = STRAIGHT
     """Requested x, y (m), roll and yaw (rad) of the shift; limited by the law."""
     toward: Toward = Toward.PERSON
-    """Where the robot moves on its own (`services.planner.law.closed_reference`)."""
+    """Direction in which the robot moves on its own (`services.planner.law.closed_reference`)."""
     released: Released = (False, False)
     """(height, pitch), each True while nobody leads it."""
     pitch_drive: float = 0.0
     """Pitch acceleration measured when the pitch was released, rad/s^2."""
     align: bool = False
-    """Start from the measured pose, so that engaging makes no step. p_C starts at the measured pose
-    and returns to zero (COM over the ankles, no roll, no yaw; height and pitch stay) over
-    `law.recentre_s` of ticks without `align`. A planner that was engaged before starts from p_C = 0
-    instead, because the measured pose is then part of a sway. HOLD would keep it after another
-    dropout, and a robot held 25 mm off centre fell at the second push. The modules' blend then
-    avoids a step. The requested shift is kept."""
+    """True while the planner does not lead: p_C starts at the measured pose, so that engaging makes
+    no step. It then returns to zero within `law.recentre_s`: COM over the ankles, no roll, no yaw;
+    height and pitch stay. After an earlier lead, p_C starts at zero instead, because the measured
+    pose is part of a sway. HOLD would keep that pose after another dropout, and a robot held 25 mm
+    off centre fell at the second push. The modules' blend then avoids a step. The requested shift
+    is kept."""
     wrench: Wrench | None = None
     """Operator's wrench on the torso; None if stale or invalid."""
     up_torso: Vector3 | None = None
@@ -108,7 +110,7 @@ class LawInputs(NamedTuple):
 
 
 class LawOutput(NamedTuple):
-    """Outputs of one tick for the twelve joints, (12,) unless another shape is given."""
+    """Outputs of one tick: (12,) for the joints, and (6,) from `p` to `closure`."""
 
     q_ref: Array
     v_ref: Array
@@ -116,11 +118,11 @@ class LawOutput(NamedTuple):
     dtau_ff: Array
     tau_coupled: Array
     tau_unfiltered: Array
-    """J^T [K_c e + B_c e' + F_I], `tau_coupled` before its low-pass."""
+    """J^T [K_c e + B_c e' + F_I]: `tau_coupled` before its low-pass, without the eased lead."""
     local: LocalGains
-    """D and D_B, certified."""
+    """D and D_B, with their margins."""
     p: Array
-    """Measured pose (6,)."""
+    """Measured pose."""
     pdot: Array
     p_ref: Array
     closure: Array
@@ -158,14 +160,13 @@ class Hocca:
     """The whole-body law. Everything that changes between ticks is in `LawState`.
 
     Attributes:
-        measured: results at the measured joints of the last tick.
-        reference: results at the last tick's reference pose.
+        measured: kinematics at the measured joints of the last tick.
+        reference: the law's quantities at the last tick's reference pose.
         split: split of the gains, with their certificate.
         load: estimate of the load beyond the robot file.
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Build the law."""
         self.measured = Measured(config)
         self.reference = Reference(config)
         gains = GainLaw(config)
@@ -211,7 +212,8 @@ class Hocca:
         terms = self._terms.evaluate(reference, p_ref - measured.p, pdot_ref - measured.pdot)
         tau_unfiltered, tau_coupled = self._coupled_torque(s, terms.coupled, p_ref, pdot_ref, dt)
         # the eased lead goes into tau_coupled, which HOLD drops; in tau_ff it would outlast the
-        # hand. It feeds forward a force, not joint rates, so the harness filter is enough
+        # hand. The harness filter is enough for it, because it depends on a force, not on joint
+        # rates
         ease_z, ease_pitch = self._easing.ease(s.easing, force, moment_pitch, assist, dt)
         tau_coupled += ease_z * reference.J_harness[2] + ease_pitch * reference.J[4]
         s.q = tuple(reference.expected(dt).tolist())

@@ -21,13 +21,14 @@ from shared.joints import N_JOINTS
 TOLERANCE = 1e-6
 """Largest residual of a solution, m or rad."""
 STEP_SURE = 1e-3
-"""rad; a Gauss-Newton step's error is below the step's square (m or rad), so below `TOLERANCE`."""
+"""rad; a Gauss-Newton step shorter than this leaves an error (m or rad) below its square, and thus
+below `TOLERANCE`."""
 STEP_MAX = 0.2
 """rad; a longer step leaves the region in which the linearisation is good."""
 
 GAIN_AT_LIMIT = 0.01
-"""Minimum reduction at a limit, as a fraction of the sum of squares. With smaller steps, out of
-reach, the legs would creep into a twist."""
+"""Minimum reduction of the sum of squares by a step at a limit, as a fraction. For a pose out of
+reach, steps that gain less would let the legs creep into a twist."""
 
 
 class IkResult(NamedTuple):
@@ -35,7 +36,7 @@ class IkResult(NamedTuple):
 
     iterations: int
     residual: float
-    """Largest absolute row, m or rad."""
+    """Largest absolute error of a row, m or rad."""
 
     @property
     def converged(self) -> bool:
@@ -44,7 +45,7 @@ class IkResult(NamedTuple):
 
 
 class InverseKinematics:
-    """Solves q_ref = IK(p_ref) into `q`; leaves `kinematics` updated at the solution."""
+    """Solves q_ref = IK(p_ref) into `q`; leaves `kinematics` updated at or near it."""
 
     def __init__(self, kinematics: Kinematics, limits: Array) -> None:
         """Set the kinematics to solve with and the joint limits (12, 2), rad."""
@@ -60,8 +61,8 @@ class InverseKinematics:
     def solve(self, p_ref: Array, D_left: Array | None = None, iterations_max: int = 4) -> IkResult:
         """Improve `q` until p(q) = p_ref and the legs agree.
 
-        A step whose second-order error is below the tolerance is taken without computing the
-        kinematics again. `kinematics` is then at most `STEP_SURE` rad from `q`.
+        After a step whose second-order error is below the tolerance, the kinematics are not
+        computed again. `kinematics` is then at most `STEP_SURE` rad from `q`.
 
         Args:
             p_ref: (6,), m and rad.
@@ -76,14 +77,14 @@ class InverseKinematics:
             step, limited = self._step_within_limits()
             self.q += step
             if limited:
-                self.q[:] = self._inside(self.q)  # exactly inside the limits
+                self.q[:] = self._inside(self.q)  # exactly, despite rounding
             iterations += 1
             largest = float(np.abs(step).max())
             if largest < STEP_SURE and not limited:
                 return IkResult(iterations, largest * largest)
             after = self._residual(p_ref, D_left)
             gained = cost - float(self._error @ self._error)
-            long_step = not limited and largest >= STEP_MAX / 2  # it may go uphill first
+            long_step = not limited and largest >= STEP_MAX / 2  # its error may grow at first
             if not long_step and gained < (GAIN_AT_LIMIT * cost if limited else 0.0):
                 self.q[:] = before
                 return IkResult(iterations, self._residual(p_ref, D_left))
@@ -93,7 +94,7 @@ class InverseKinematics:
     def _step_within_limits(self) -> tuple[Array, bool]:
         """Return the next step (12,), inside the joint limits, and True if the limits changed it.
 
-        Clipping alone would let the other joints move on without the joint that stopped.
+        Clipping alone would move the other joints as if none had stopped at its limit.
         """
         step = limited_length(self.solve_rates(self._error), STEP_MAX)
         limited = bool((self._inside(self.q + step) != self.q + step).any())
@@ -145,5 +146,5 @@ class InverseKinematics:
 
 
 def limited_length(step: Array, largest: float) -> Array:
-    """Return the step, shortened until no element exceeds `largest`."""
+    """Return the step, scaled down if an element exceeds `largest`."""
     return step * (largest / max(largest, float(np.abs(step).max())))

@@ -2,7 +2,7 @@
 
 p = [COM x y z; torso roll pitch yaw]. The load-sharing matrices D mix the two legs' estimates of
 the torso: J_torso = [D_R^T J_R, D_L^T J_L]. J^T F then requests from each foot a wrench that its
-sole can give. The knees' masses enter through their own leg. `services.planner.law.symbolic` holds
+sole can bear. Each knee's mass enters through its own leg. `services.planner.law.symbolic` contains
 the equations.
 """
 
@@ -25,8 +25,8 @@ _GRAPHS: Final[dict[tuple[MassConfig, GeometryConfig, LawConfig], symbolic.Graph
 """Graphs per robot. A process builds each once, because that takes a tenth of a second."""
 _GRAPHS_KEPT: Final = 16
 DETERMINANT_MIN: Final = 0.05
-"""m^3; smallest determinant of a leg's Jacobian. Straighter or more folded legs (outside 0.79 to
-1.27 m) give no wrench, because 1 N m of friction would count as more than 10 N."""
+"""m^3; minimum determinant of a leg's Jacobian. For straighter or more folded legs (hip to ankle
+outside 0.79 to 1.28 m) the force is unknown: 1 N m of friction would count as more than 10 N."""
 
 
 class Kinematics:
@@ -42,12 +42,12 @@ class Kinematics:
 
     The caller writes:
 
-    - `stance` (6,): pose of the right foot relative to the left, as deviation from the robot file:
-      x, y, z in m and a rotation vector in rad, world axes. The origin is midway between the feet.
+    - `stance` (6,): pose of the right foot relative to the left, as a deviation from the robot
+      file: x, y, z in m and a rotation vector in rad, world axes. The origin is midway between the
+      feet.
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Build the graphs from the generated model."""
         graphs = graphs_of(config)
         self._sharing = CompiledGraph(graphs.sharing)
         self._pose = CompiledGraph(graphs.pose)
@@ -69,8 +69,8 @@ class Kinematics:
 
         Args:
             q: joint angles.
-            D_left: load sharing (6, 6) to use; None computes it at q. Within a tick the sharing is
-                fixed, chosen at the measured pose.
+            D_left: load sharing (6, 6) to use; None computes it at q. A tick uses the sharing of
+                the measured pose throughout.
         """
         if D_left is None:
             self._sharing.arguments[0][:] = q
@@ -86,8 +86,9 @@ class Kinematics:
     def hessian_times(self, F: Array, F_harness: Array) -> Array:
         """Return sum_i H_i F_i (12, 12), plus the harness point's term for its force, N m/rad.
 
-        It is d(J^T F)/dq at the last `update`, with each leg's share of the wrench constant. It is
-        symmetric, and exact along the closed chain. The next call overwrites it.
+        It is d(J^T F + J_harness^T F_harness)/dq at the last `update`, with each leg's share of the
+        wrench constant. It is symmetric, and exact along the closed chain. The next call overwrites
+        it.
 
         Args:
             F: wrench along p (6,): N, and N m along roll, pitch, yaw.
@@ -112,7 +113,6 @@ class Measured:
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Build the graph."""
         graphs = graphs_of(config)
         self._graph, self._stance = CompiledGraph(graphs.measured), CompiledGraph(graphs.stance)
         self._q, self._v, self.stance = self._graph.arguments
@@ -140,8 +140,8 @@ class Measured:
     def leg_loads(self, tau: Array) -> tuple[float, float]:
         """Return the upward force of right and left leg on the torso, N; NaN if unknown.
 
-        It is unknown for straight and folded legs (`DETERMINANT_MIN`). A leg carries part of its
-        own weight, which is not subtracted.
+        It is unknown for straight and folded legs (`DETERMINANT_MIN`). The joint torques also carry
+        part of the leg's own weight, which is not subtracted.
 
         Args:
             tau: joint torques (12,), N m.

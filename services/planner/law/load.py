@@ -2,7 +2,9 @@
 
 The open directions have no stiffness, so an unknown weight moves the robot as soon as nobody holds
 it. A momentum observer estimates the weight from the joint torques. F is the wrench along p that
-joints and person (w_h) support, n the rise of the harness point along p, M the torso's mass:
+joints and person support, and n the rise of the harness point along p. f_h and m_h are the person's
+force and pitch moment. m is the robot's mass in the file, dm the surplus mass; M and I are the
+torso's mass and inertia about pitch:
 
     F         = T^T (tau + J_harness^T f_h + J_pitch^T m_h)       [J; C] T = [I; 0]
     n         = T^T J_harness,z
@@ -13,12 +15,12 @@ a and b are the moments that support the surplus weight about the harness point,
 depends on how far behind the weight lies, b on how low. The estimate is low-passed, and reduced by
 the amount that dry friction in the joints hides. It is fed forward like the assist, so it is part
 of every tick's certificate. Beyond `law.load_correction` the planner does not engage, because
-schedule and studies then describe another robot. An error of the harness counts as load.
+schedule and studies then describe another robot. An error of the harness sensor looks like load.
 
-The planner does not engage on a robot that hangs on a hoist either: the feedforward would lift it
-off. If its payload is missing, the feedforward would lift it to straight legs (0.1 m up), where
-torques do not show the load. The planner holds until the feet carry the file's weight within the
-limit. This check needs no harness, because no hand lifts half the robot.
+Nor does the planner engage while the robot hangs on a hoist, because the feedforward would lift it
+off the hoist. Without its payload, it would rise to straight legs (0.1 m up), where torques do not
+show the load. The planner holds until the feet carry the file's weight within the limit. This check
+needs no harness, because no hand lifts half the robot.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ drivetrain and a mass error of 5 % look like 8 kg."""
 STILL_RATES: Final = (0.05, 0.1)
 """m/s of the harness point and rad/s of the torso's pitch; slower counts as rest."""
 FRICTION_BAND: Final = (8.0, 1.5)
-"""Force, N, and moment, N m, that dry friction may hide (0.3 N m a joint hides 6 N)."""
+"""Force, N, and moment, N m, that dry friction may hide (0.3 N m per joint hides 6 N)."""
 WEIGHING_S: Final = 1.0
 """s; time for which a lowered robot's load must stay within the limits: four time constants."""
 RESUME_FRACTION: Final = 0.8
@@ -56,11 +58,12 @@ class LoadState(msgspec.Struct):
     kg: float = 0.0
     """Surplus mass."""
     a: float = 0.0
-    """N m along pitch, for a load behind (+) or ahead of the file's centre."""
+    """N m about pitch, for a load behind (+) or ahead of the file's centre."""
     b: float = 0.0
-    """N m along pitch, for a load below (+) or above it, with the torso at 90 degrees."""
+    """N m about pitch, for a load below (+) or above it, with the torso at 90 degrees."""
     rates: Pair | None = None
-    """Rates at the last estimate; None while it pauses (stale state, or a leg hides the load)."""
+    """Rates of harness height and torso pitch at the last update; None while the estimate pauses,
+    because a state is stale or a leg's load unknown."""
     refused: bool = False
     weighing_s: float = 0.0
     looked: bool = False
@@ -68,7 +71,7 @@ class LoadState(msgspec.Struct):
 
     @property
     def blocks(self) -> bool:
-        """True while the load differs too much from the file, or is still unknown."""
+        """True while the load differs too much from the file, or is still being weighed."""
         return self.refused or self.weighing_s > 0.0
 
     def moment(self, pitch: float) -> float:
@@ -77,13 +80,13 @@ class LoadState(msgspec.Struct):
 
 
 class Load:
-    """Low-passed surplus load."""
+    """Estimator of the surplus load, low-passed."""
 
     def __init__(self, correction_max: Pair, weight: float, mass: float, inertia: float) -> None:
-        """Start with the robot file's load.
+        """Set the limits, and the robot file's weight, mass and inertia.
 
         Args:
-            correction_max: `law.load_correction`: kg and N m; zero disables the estimate.
+            correction_max: `law.load_correction`: kg and N m; two zeros disable the estimate.
             weight: weight of the whole robot in the file, N.
             mass: mass of the torso, kg.
             inertia: inertia of the torso about pitch, kg m^2.
@@ -95,7 +98,7 @@ class Load:
     def refusal(self, s: LoadState) -> str:
         """Return the reason for refusing the load and the remedy; "" if it is accepted."""
         if not s.refused:
-            return "its load is being weighed" if s.weighing_s > 0.0 else ""
+            return "the load is being weighed" if s.weighing_s > 0.0 else ""
         if self._is_hung(s):
             return (
                 "the robot hangs: lower it until its feet bear its weight. If it stands, it "
@@ -113,12 +116,12 @@ class Load:
                 f"harness (`xrl drive tare`); if that changes nothing{held_up}, set mass.payload, "
                 "then run `xrl gains`"
             )
-        for moment, positive, negative in ((s.a, "behind", "ahead"), (s.b, "low", "high")):
+        for moment, positive, negative in ((s.a, "behind", "ahead"), (s.b, "down", "up")):
             if abs(moment) > RESUME_FRACTION * self._moment_max:
                 reasons.append(
                     f"the load lies too far {positive if moment > 0.0 else negative}, by "
-                    f"{abs(moment):.0f} N m: at most {self._moment_max:g} N m is accepted "
-                    f"({RESUME_FRACTION * self._moment_max:g} once refused)"
+                    f"{abs(moment):.0f} N m: centre it; at most {self._moment_max:g} N m is "
+                    f"accepted ({RESUME_FRACTION * self._moment_max:g} once refused)"
                 )
         return "; ".join(reasons)
 
@@ -170,10 +173,10 @@ class Load:
             s.weighing_s = WEIGHING_S if s.refused else max(0.0, s.weighing_s - dt)
 
     def advance_without_harness(self, s: LoadState, F_z: float, dt: float, *, led: bool) -> None:
-        """Update without a harness, from the joints' force along z, N: check only if it hangs.
+        """Update from the joints' force along z, N: only check whether the robot hangs.
 
         Without a harness, a load cannot be distinguished from a hand. Once the robot is lowered,
-        the file's load is accepted.
+        the file's load is assumed.
         """
         surplus, s.rates = F_z - self._weight, None
         if self._hangs_at_start(s, surplus, led=led) or s.weighing_s == 0.0:
@@ -189,7 +192,7 @@ class Load:
     def _hangs_at_start(self, s: LoadState, surplus: float, *, led: bool) -> bool:
         """Return True at the first update of a robot that hangs.
 
-        Its load is then weighed, and the planner does not engage before it is known.
+        The planner then does not engage before its load is weighed.
 
         Args:
             s: state of the estimate; updated in place.

@@ -1,9 +1,9 @@
 """Robot model in Pinocchio, and each leg's screw axes from the foot up.
 
 Pinocchio reads the MJCF that `shared.robot.robot_model` generates, the only source of the model.
-Its root is the torso. The feet stand still, so the law needs each leg from the foot up: the leg's
-six screw axes in the foot's frame, and the torso's position at q = 0. The product of exponentials
-is T_torso(q) = exp(s_1 q_1) ... exp(s_6 q_6) T_torso(0).
+The root of its tree is the torso. The feet stand still, so the law needs each leg from the foot up:
+its six screw axes in the foot's frame, and the torso's position at q = 0. The product of
+exponentials is T_torso(q) = exp(s_1 q_1) ... exp(s_6 q_6) T_torso(0).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class LegGeometry(NamedTuple):
     r_knee: Array
     """Knee (3,), m."""
     r_torso: Array
-    """Torso origin by this leg (3,), m. The torso's axes are the world's."""
+    """Torso origin, m (3,). The torso's axes are the world's."""
 
 
 def load_pinocchio(config: RobotConfig) -> pin.Model:
@@ -66,8 +66,8 @@ def leg_geometry(config: RobotConfig) -> tuple[LegGeometry, LegGeometry]:
         foot, knee = (_joint_index(model, kind, side) for kind in ("ankle", "knee"))
         foot_offset = np.array(r_foot) - data.oMi[foot].translation
         screws = data.J[:, 6 + columns].T
-        # the torso's rotation relative to the foot is the foot's relative to the torso,
-        # reversed
+        # the torso's rotation relative to the foot is the reverse of the foot's relative to the
+        # torso
         axes = -screws[:, 3:]
         points = np.cross(axes, -screws[:, :3]) + foot_offset
         r_knee = data.oMi[knee].translation + foot_offset
@@ -84,7 +84,6 @@ class BodyInertia:
     """Inertia of the body along p with both feet fixed, without the rotors."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Load the model."""
         self._model = load_pinocchio(config)
         self._model.armature = np.zeros(self._model.nv)
         self._data = self._model.createData()
@@ -113,16 +112,15 @@ class BodyInertia:
 
 
 class HangingLegs:
-    """Joint-space statics and inertia of a torso that hangs still, upright, feet in the air."""
+    """Joint statics and inertia while the torso hangs upright and still, feet in the air."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Load the model."""
         self._model = load_pinocchio(config)
         self._model.armature = np.zeros(self._model.nv)
         self._data = self._model.createData()
 
     def inertia(self, q: Array) -> Array:
-        """Return the inertia about each joint (12,), kg m^2, with the others held, without rotor.
+        """Return the inertia about each joint (12,), kg m^2, without rotor, the other joints held.
 
         Args:
             q: joint angles (12,), rad.

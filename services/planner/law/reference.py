@@ -2,9 +2,10 @@
 
 The graph (`services.planner.law.symbolic`) makes one Gauss-Newton step of the inverse kinematics
 from the extrapolated last reference. While the planner leads, that step is below `STEP_SURE`, so
-its error is within the solver's tolerance and nothing is evaluated twice. While it holds, two steps
-lead from the measured pose to the centred one. If `STEPS_MAX` steps are too few, or one leaves the
-joint limits, `InverseKinematics` solves, and the graph is evaluated at its solution.
+its error is within the solver's tolerance and nothing is evaluated twice. While the planner holds,
+the graph makes two steps from the measured pose to the centred one. If `STEPS_MAX` steps are too
+few, or a step leaves the joint limits, `InverseKinematics` solves, and the graph is evaluated at
+its solution.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.compiled_graph import CompiledGraph
 
 STEPS_MAX: Final = 3
-"""Maximum steps by the graph. Near a solution each step squares the error."""
+"""Maximum number of the graph's steps. Near a solution each step squares the error."""
 
 
 class _ReferenceInputs(msgspec.Struct, frozen=True):
@@ -68,7 +69,6 @@ class Reference:
     """
 
     def __init__(self, config: RobotConfig) -> None:
-        """Build the graph and the solver."""
         limits = np.array(config.joint_limits())
         self._ik = InverseKinematics(Kinematics(config), limits)
         self._graph = CompiledGraph(graphs_of(config).reference)
@@ -104,7 +104,7 @@ class Reference:
         for iterations in range(1, STEPS_MAX + 1):
             self._graph()
             largest, beyond = self._check.tolist()
-            if not (0.0 <= largest < STEP_MAX and beyond <= 0.0):  # mmax makes NaN -inf
+            if not (0.0 <= largest < STEP_MAX and beyond <= 0.0):  # mmax turns NaN into -inf
                 break
             if largest < STEP_SURE:
                 self.q[:] = self._q_next
@@ -117,9 +117,9 @@ class Reference:
         return result
 
     def expected(self, dt: float) -> Array:
-        """Return the reference extrapolated by dt, s, at its present rate (12,), rad.
+        """Return the reference (12,), rad, extrapolated by dt (s) at its present rate.
 
-        It is within the joint limits, as the solver's solutions are.
+        It is clipped to the joint limits.
         """
         start: Array = self.v * dt
         start += self.q

@@ -1,13 +1,13 @@
-"""Joint gains of the whole body, and their local part, which the joint services hold. Pure.
+"""Joint gains of the whole body, and their local part, which the joint services apply. Pure.
 
 Joint stiffness and damping of the whole body are (paper section III)
 
     K_q = N K_0 + J^T K_p J - sum_i H_i F_i,    B_q = N B_0 + J^T B_p J,    N = I - J^+ J.
 
 The split chooses the local part D (docs/law.md#gain-split). `certified` takes D from the schedule
-computed offline; `diagonal` is the paper's diag(K_q). In both cases the certificate checks the
-gains. If D misses the margin, the split stiffens D towards certified gains. If no step meets the
-margin, the source is UNCERTIFIED and the robot must hold.
+computed offline; `diagonal` is the paper's diag(K_q). In both cases the certificate checks D. If D
+misses a margin, the split stiffens it in steps. If no step meets the margins, the gains are
+marked UNCERTIFIED and the robot must hold.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class JointGains(NamedTuple):
 
 
 class GainLaw:
-    """Gains at one configuration."""
+    """Whole-body joint gains at a configuration."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Filter K_p and B_p by S_perp: no stiffness in the directions that the operator leads."""
+        """Filter K_p and B_p by S_perp: both are 0 in the directions that the operator leads."""
         law = config.law
         self.S: Array = np.array(law.S, dtype=float)
         closed = 1.0 - self.S
@@ -69,11 +69,11 @@ class GainLaw:
 
 
 STIFFEN_FRACTIONS: Final = (0.25, 0.5, 0.75, 1.0)
-"""Fractions of the way from the wanted D to the stiff one, tried in turn."""
+"""Steps, as fractions of the way from D to the stiffest allowed D, tried in turn."""
 
 
 class LocalGains(NamedTuple):
-    """Local gains, on which the joint services hold without the planner."""
+    """Local gains, with which the joint services hold without the planner."""
 
     D: Array
     """(12,) local stiffness, N m/rad, >= 0."""
@@ -92,14 +92,13 @@ class CouplingGains(NamedTuple):
 
 
 UNCERTIFIED_COUPLING: Final = CouplingGains(4.0, 1.0)
-"""Without a schedule: for the paper's split or averaged legs, which serve for comparison."""
+"""Used with the paper's split, which has no schedule, for comparison."""
 
 
 class ScheduledGains:
     """D over COM height and pitch: bilinear between nodes, constant beyond the last."""
 
     def __init__(self, schedule: GainSchedule) -> None:
-        """Store the table."""
         self._z, self._pitch = schedule.z, schedule.pitch
         table = np.array(schedule.D)
         self._table: Array = np.concatenate((table, table), axis=2)
@@ -126,7 +125,7 @@ class GainSplit:
     """Choice of D and D_B, with their certificate."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Load the schedule, the limits and the stiff gains to fall back on.
+        """Load the schedule, the limits and the stand gains.
 
         Raises:
             ConfigError: the split needs a schedule, and the robot's is missing or stale.
@@ -161,9 +160,10 @@ class GainSplit:
         """Return the local gains at a reference pose.
 
         Args:
-            body_gains: returns K_q and B_q there; called only if the schedule misses the margins.
+            body_gains: returns K_q and B_q at this pose; called only without a schedule, or if the
+                schedule misses the margins.
             z: COM height, m.
-            pitch: of the torso, rad.
+            pitch: torso pitch, rad.
             T: joint rates per unit of p along the closed chain (12, 6).
             hessian_O: as in `Certificate.at`.
         """
@@ -187,7 +187,8 @@ class GainSplit:
     def certify(self, D: Array) -> LocalGains:
         """Return the gains of a controller's own D, with margins at the pose of the last `split`.
 
-        The source is UNCERTIFIED if D misses the margins, is negative or exceeds its limit.
+        The source is UNCERTIFIED if D misses the margins, is negative or exceeds its limit, or if
+        the robot has no schedule.
         """
         D_B = self._schedule.D_B if self._schedule is not None else np.zeros(N_JOINTS)
         margins = self.certificate.margins(D)
@@ -211,7 +212,7 @@ class GainSplit:
     def _stiffen(
         self, D: Array, diagonal: Array, margins: Margins
     ) -> tuple[Array, Margins, SplitSource]:
-        """Return the softest certified gains on the way to the stiffest allowed ones."""
+        """Return the softest gains that meet the margins, from D to the stiffest allowed."""
         stiff = np.maximum(np.maximum(D, self._stand), self._k_q_fraction_max * diagonal)
         stiff = np.minimum(stiff, self._k_max)
         for fraction in STIFFEN_FRACTIONS:

@@ -1,9 +1,10 @@
 """Kinematics as expression graphs, built once and evaluated without Python in between.
 
-The CasADi graphs hold the equations of docs/law.md#load-sharing. Both legs are products of
-exponentials, and the load-sharing matrices D mix the torso's pose from them. p, its Jacobian and
-the Hessian term of K_q follow. In NumPy, calls on 3-vectors cost more than their arithmetic: a
-planner tick took 0.5 ms alone, and 1.5 ms beside the fleet's other processes on two cores.
+The CasADi graphs contain the equations of docs/law.md#load-sharing. Both legs are products of
+exponentials, and the load-sharing matrices D mix their estimates of the torso's pose. p, its
+Jacobian and the Hessian term of K_q follow. With NumPy, whose calls on 3-vectors cost more than
+their arithmetic, a planner tick took 0.5 ms alone, and 1.5 ms beside the fleet's other processes on
+two cores.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class Graphs(NamedTuple):
     pose: ca.Function
     """(q, stance, D_L) -> p, closure, J, C, J_harness, r_torso, r_harness."""
     hessian: ca.Function
-    """(q, stance, D_L, F, F_harness) -> sum_i H_i F_i (12, 12)."""
+    """(q, stance, D_L, F, F_harness) -> sum_i H_i F_i (12, 12), plus the term of F_harness."""
     stance: ca.Function
-    """q -> stance (6,) in which the legs agree: position of the right foot relative to the left."""
+    """q -> stance (6,) in which the legs agree, as in `Kinematics`."""
     measured: ca.Function
     """(q, v, stance) -> D_L, p, closure, J, C, J_harness, pdot; per leg, the row (2, 6) that maps
     its torques to its upward force, and its Jacobian's determinant (2,), m^3."""
@@ -92,7 +93,7 @@ def build(config: RobotConfig, geometry: tuple[LegGeometry, LegGeometry]) -> Gra
 def _measured(sharing: ca.Function, pose: ca.Function) -> ca.Function:
     """Return the graph of a tick's kinematics at the measured joints.
 
-    It calls the other graphs, because code of one flat expression would be slow in a cold cache.
+    It calls the other graphs, because the code of one flat expression is slow in a cold cache.
     """
     q, v, stance = ca.MX.sym("q", N_JOINTS), ca.MX.sym("v", N_JOINTS), ca.MX.sym("s", 6)
     D_left = sharing(q, stance)
@@ -272,7 +273,7 @@ def _hessian(
     """Return d(J^T F + J_harness^T F_harness)/dq, symmetric, block diagonal: docs/law.md (20).
 
     Each leg's share of the wrench is constant. A change of the sharing with q only moves forces
-    between the legs, which no motion of the closed chain feels. For joint j below joint k,
+    between the legs, which do no work along the closed chain. For joint j below joint k,
     dJ_k/dq_j = a_j x J_k and da_k/dq_j = a_j x a_k. The symmetric part for a moment is its second
     derivative by the torso's rotation vector. Automatic differentiation gives the curvature of the
     angles and of the arm to the harness point over that rotation; half of it is added to each leg.
@@ -322,10 +323,10 @@ def _by_rotation(config: RobotConfig, rotation: ca.SX, F: ca.SX, F_harness: ca.S
 def _left_load_share(config: RobotConfig, feet: list[_Foot], legs: list[_Leg]) -> ca.SX:
     """Return D_L (6, 6), the left leg's share of a torso wrench: docs/law.md (14).
 
-    Leg i gives the torso the wrench X_i w_i, with w_i at its foot. Foot moments are costly: beyond
-    a lever of a few centimetres the sole tips. W weights them. The least-effort distribution of a
-    torso wrench F is w_i = W X_i^T A^-1 F, with A = sum X_i W X_i^T. Leg i's share at the torso is
-    therefore D_i = X_i W X_i^T A^-1. Moments are in the foot's axes.
+    Leg i applies the wrench X_i w_i to the torso, with w_i at its foot. W makes foot moments
+    costly, because a sole tips beyond a lever of a few centimetres. The least-effort distribution
+    of a torso wrench F is w_i = W X_i^T A^-1 F, with A = sum X_i W X_i^T. Leg i's share at the
+    torso is therefore D_i = X_i W X_i^T A^-1. Moments are in the foot's axes.
     """
     middle = 0.5 * (legs[0].r_torso + legs[1].r_torso)
     if config.law.jacobian == "average":

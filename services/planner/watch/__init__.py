@@ -1,1 +1,1 @@
-"""Reasons for the planner to hold, stiffen modules or yield to another planner. Pure."""
+"""Reasons for the planner to hold, yield, stiffen modules or move the robot on its own. Pure."""

@@ -1,12 +1,12 @@
 """Check of a custom controller's actions before they become commands. Pure.
 
-Gains that do not stand alone at this pose are never sent: the tick is UNCERTIFIED, and all modules
-hold. They also hold while the capture point, or the pose in which HOLD would settle on this action,
-is near the edge of the soles. A controller that tips the robot over smoothly violates no joint's
-bounds, and made it fall.
-If a controller raises or returns an invalid action, the guard does not call it again: all modules
-hold until the planner restarts. The joint services refuse steps, references and torques beyond
-their bounds (`services.joint.envelope`).
+Gains that cannot hold the robot alone in this pose are never sent: the tick is UNCERTIFIED, and all
+modules hold. They also hold while the capture point, or the pose in which HOLD would settle on this
+action, is near the edge of the soles. Without this check, a controller that smoothly tipped the
+robot over made it fall although every joint stayed within its bounds. If a controller raises or
+returns an invalid action, the guard never calls it again: all modules hold until the planner
+restarts. The joint services refuse steps, references and torques beyond their bounds
+(`services.joint.envelope`).
 """
 
 from __future__ import annotations
@@ -26,36 +26,38 @@ from shared.joints import N_JOINTS
 from shared.robot.frames import capture_point
 
 SUPPORT: Final = 0.5
-"""Fraction of the soles within which the capture point and the rest in HOLD must be."""
+"""Fraction of the support area's half length and half width, within which the capture point and the
+rest pose in HOLD must be."""
 CALM: Final = 0.6
-"""Fraction of that area within which the capture point must be before the controller resumes."""
+"""Fraction of that range within which the capture point must be before the controller resumes."""
 REST_S: Final = 1.0
-"""First hold time after an objection, s, counted while calm; doubles each time to `WAIT_MAX_S`."""
+"""Hold time after the first objection, s, counted while calm; each further objection doubles it, up
+to `WAIT_MAX_S`."""
 WAIT_MAX_S: Final = 60.0
 FORGET_S: Final = 25.0
-"""Time of leading without an objection after which the hold time restarts at `REST_S`, s."""
+"""Time of leading without objection, s, after which the next hold time is `REST_S` again."""
 _AT_REST: Final = (0.0,) * 6
 WORDS: Final = 200
 """Maximum length of a reason in the status, characters."""
 
 
 class GuardState(msgspec.Struct):
-    """State of `ControllerGuard`, without the controller's own, which `reset` initialises."""
+    """State of `ControllerGuard`; the controller's own state is not part of it."""
 
     failed: bool = False
-    """The guard does not call the controller again."""
+    """True once the guard no longer calls the controller."""
     why: str = ""
     """Reason why the last tick did not use the controller's action, or ""."""
     rest_s: float = 0.0
     """Remaining hold time, s."""
     wait_s: float = 0.0
-    """Newest full hold time, s."""
+    """Full hold time after the last objection, s."""
     time_s: float = 0.0
     """Time since the controller's last reset, s."""
 
 
 class ControllerGuard:
-    """Runs a controller, and passes on the actions that meet every check."""
+    """Runs a controller, and accepts those of its actions that pass every check."""
 
     def __init__(
         self,
@@ -74,8 +76,8 @@ class ControllerGuard:
         Args:
             state: state of this guard; updated in place.
             seen: observation of this tick; its `time_s` is set here.
-            leads: the planner leads; otherwise the controller is reset, and the shipped law's
-                output is returned, which starts at the measured pose.
+            leads: True if the planner leads; otherwise the controller is reset, and the shipped
+                law's output is returned, which starts at the measured pose.
         """
         law = seen.law
         state.time_s = state.time_s + seen.dt if leads else 0.0
@@ -113,7 +115,7 @@ class ControllerGuard:
         )
 
     def _rested(self, state: GuardState, seen: Observation) -> LawOutput:
-        """Return the shipped law's output; after an objection all hold until the robot is calm."""
+        """Return the shipped law's output, marked uncertified after an objection until calm."""
         if state.why:
             x, y = capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope)
             calm = abs(x) <= CALM * self._room[0] and abs(y) <= CALM * self._room[1]
@@ -128,7 +130,8 @@ class ControllerGuard:
         if local.source is SplitSource.UNCERTIFIED:
             service, onboard = local.margins
             return (
-                f"the controller's gains do not stand alone: margins {service:.2f}, {onboard:.2f}"
+                f"the controller's gains do not hold the robot alone (margins {service:.2f} and "
+                f"{onboard:.2f}), or are outside 0 to joint_service.k_p_max"
             )
         held = action.D * (action.q_ref - seen.q) + action.tau_ff - seen.law.tau_ff
         moves = self._law.rest_from_here(action.D, held)[:2].tolist()
@@ -172,7 +175,6 @@ def _frozen(seen: Observation) -> Observation:
 
 
 def _arrays_of(values: LawOutput | Observation) -> dict[str, Any]:
-    """Return copies of the arrays, by name."""
     named = values._asdict()
     return {name: _read_only(v) for name, v in named.items() if isinstance(v, np.ndarray)}
 

@@ -4,20 +4,18 @@
 state is stale, or one module is not in TRACK, every command carries `hold`, so that no leg works
 against the other. Modules report `ready` once commands have been fresh for long enough. When all
 are ready, the planner engages: it lifts `hold` for all in the same tick, and they have `GRACE_NS`
-to report TRACK. An overload at the harness and gains that do not stand alone also set `hold`.
+to report TRACK. An overload at the harness and uncertified gains also set `hold`.
 
-After a dropout of any module, a trip, or gains that do not stand alone, the planner waits before
-it re-engages; the wait grows with the number of recent dropouts. Without the wait, six links that
-drop out in turn would make the robot flap between TRACK and HOLD.
+After a dropout of any module, a trip, or uncertified gains, the planner waits before it re-engages;
+the wait grows with the number of recent dropouts. Without the wait, six links that drop out in turn
+would make the robot flap between TRACK and HOLD.
 
-**Two planners** on one bus, by accident: the one that modules follow keeps leading, the other
-waits. A module accepts another planner's commands once those of its present planner are too old. A
-second planner that sends would therefore take over one module after the other, each at the first
-late message. So a planner that sees modules follow another one leads none until that one has ended.
-It announces itself by commands that every module refuses: `xrl status` and the log then show both.
+**Two planners** on one bus, by accident (docs/architecture.md, Two planners). A planner that sees
+modules follow a rival does not lead until the rival has ended. It announces itself by commands that
+every module refuses; `xrl status` and the log then show both.
 
 **Limp legs.** Modules stiffen when another one may be limp. Joint services on one host detect a
-limp neighbour without a planner (`services.joint.neighbours`). The planner adds modules on other
+limp neighbour without a planner (`services.joint.neighbours`). The planner covers modules on other
 hosts, and a module that restarts and stays DISARMED.
 """
 
@@ -37,22 +35,21 @@ from shared.robot.hold_rules import SUPPORT_FOR, Dropouts, Support
 GRACE_NS = 150_000_000
 """Timeout for the modules to report TRACK after `hold` is lifted, ns."""
 WAITS_NS: Final = tuple(round(s * NS_PER_S) for s in (0.0, 0.5, 1.5, 4.0, 10.0, 20.0, 30.0))
-"""ns; minimum time from a dropout to re-engaging, by the number of counted dropouts. With these
-and `FORGET_NS`, no network causes more than six dropouts in a minute. Index 0: no dropout
-is counted."""
+"""ns; minimum time from a dropout to re-engaging, by the number of counted dropouts (index 0:
+none). With these and `FORGET_NS`, no network causes more than six dropouts in a minute."""
 FORGET_NS: Final = 25 * NS_PER_S
-"""ns; each time engaged for this long without a dropout removes one from the count. With 20 s,
-seven dropouts would fit into a minute."""
+"""ns; each such period, engaged and without a dropout, removes one dropout from the count. With
+20 s, seven dropouts would fit into a minute."""
 
 _NOT_TRACKABLE: Final = (Mode.FAULT, Mode.DAMP)
 """Modes from which no module returns to TRACK, so waiting is useless."""
 _DROPPED: Final = (
     PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED, PlannerMode.UNCERTIFIED,
 )  # fmt: skip
-"""Modes after LEADING that count as a dropout. OVERLOADED, MISLOADED and MISPLACED have a delay or
-a hysteresis of their own; gains at the edge of their margin do not."""
+"""Modes after LEADING that count as a dropout. OVERLOADED, MISLOADED and MISPLACED do not: unlike
+UNCERTIFIED, each has its own delay or hysteresis."""
 
-# Compared in each tick: docs/contributing.md, The control path.
+# Constants, because each tick compares them (docs/contributing.md, The control path).
 _TRACK: Final = Mode.TRACK
 _LEADING, _ALIGNING, _WAITING = PlannerMode.LEADING, PlannerMode.ALIGNING, PlannerMode.WAITING
 
@@ -64,7 +61,7 @@ class Engagement(msgspec.Struct):
     since_ns: int = 0
     """Time at which the mode was entered."""
     dropouts: Dropouts = msgspec.field(default_factory=Dropouts)
-    """Recent dropouts of modules; the count is an index of `WAITS_NS`."""
+    """Recent dropouts of modules; the count is an index into `WAITS_NS`."""
 
     def advance(
         self,
@@ -78,7 +75,7 @@ class Engagement(msgspec.Struct):
 
         Args:
             now_ns: the planner's clock.
-            fresh: per module, a state has arrived within `planner.state_stale_ms`.
+            fresh: per module, True if a state has arrived within `planner.state_stale_ms`.
             ready: per module, `JointState.ready`.
             modes: per module, `JointState.mode`.
             inhibit: mode that prevents engaging, such as OVERLOADED; None if the planner may
@@ -130,16 +127,16 @@ class Engagement(msgspec.Struct):
 
 
 AGAIN_NS: Final = 500 * NS_PER_MS
-"""Age of the rival's newest command, above which a planner without followers may lead. With a
-younger command, the rival may only have been held up."""
+"""Age of the rival's newest command above which a planner without followers may lead. A
+rival with a younger command may merely be late."""
 
 
 ANNOUNCE_NS: Final = 200 * NS_PER_MS
-"""Period of announcements while yielding; within the window of `xrl status`."""
+"""Period of announcements while yielding; shorter than the 0.5 s for which `xrl status` listens."""
 
 
 class RivalWatch(msgspec.Struct):
-    """Knowledge about a rival planner."""
+    """State of the watch for a rival planner."""
 
     yields: bool = False
     """True while this planner yields to the rival and leads no module."""
@@ -157,8 +154,8 @@ class RivalWatch(msgspec.Struct):
             age_max_ns: maximum age of a command; with an older one, a module holds.
 
         Returns:
-            True if this planner must continue in a new session, because a module has retired the
-            present one for a rival's and refuses it for good.
+            True if this planner must continue in a new session, because a module followed a rival
+            and refuses the present session for good.
         """
         if all(state.session == own for state in states):  # as in nearly every tick
             self.yields = False
@@ -194,7 +191,7 @@ class RivalWatch(msgspec.Struct):
         if not self.yields:
             return ""
         return (
-            f"another planner leads (session {self.session}); end one of them. This planner "
+            f"another planner leads (session {self.session}); end one of the two. This planner "
             "resumes when the other has ended"
         )
 
@@ -204,9 +201,9 @@ def _is_in_use(state: JointState, age_max_ns: int) -> bool:
 
 
 DISARMED_NS: Final = 200 * NS_PER_MS
-"""ns; a module DISARMED for longer is not about to take over its drive."""
+"""ns; a module that is DISARMED for longer is not about to take over its drive."""
 
-# Compared in each tick, for six modules: docs/contributing.md, The control path.
+# Constants, because each tick compares them for six modules.
 _DISARMED, _FAULT, _HOLDING = Mode.DISARMED, Mode.FAULT, DriveStatus.HOLDING
 
 

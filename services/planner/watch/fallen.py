@@ -1,21 +1,22 @@
 """Detection of a fall from the robot's own measurements. Pure.
 
-After a fall all six modules go limp (`services.joint.setpoint_law`); a false alarm would let a
-standing robot sink to the floor. No sign counts alone: two must agree for `AFTER_NS`.
+After a fall all six modules only damp (`services.joint.setpoint_law`); a false alarm would let a
+standing robot sink to the floor. No sign counts alone: two must be present for `AFTER_NS`.
 
-    tilted    by the IMU, the plane of the soles is off gravity by more than `TILT_MAX`
+    tilted    by the IMU, the plane of the soles is off level by more than `TILT_MAX`
     apart     the two legs disagree about the torso by more than `APART_MAX`: a sole is up
     whirled   by the IMU's gyroscope, that plane turned faster than `WHIRL_MIN` a moment ago
     turned    the torso is turned on its legs farther than a person leads it
-    tipped    a sole's pressure was at its edge a moment ago, while both bore the robot
+    tipped    a sole's pressure was near its edge a moment ago, while both soles bore the robot
     unloaded  the soles bear less than `UNLOADED` of the weight
 
-With an IMU, `tilted` or `apart` must be one of the two. Without one, a robot that topples stiffly
-on straight legs goes undetected: figures in docs/hazards.md. On straight legs the joint torques do
-not show the load of the soles, so `unloaded` then counts only beside `turned` or `apart`.
+With an IMU, one of the two must be `tilted` or `apart`. Without an IMU, the fall of a robot that
+topples stiffly on straight legs is not detected (docs/hazards.md). On straight legs the joint
+torques do not show the load of the soles. With `turned` or `apart`, an unknown load counts as
+`unloaded`.
 
-The fallen state ends when a person has re-armed the modules: one that had let go holds again. The
-planner then starts like a new one, and leads only a robot whose feet bear its weight.
+The fallen state ends when a module that was in DAMP or FAULT holds again, because a person re-armed
+it. The planner then starts like a new one, and leads only a robot whose feet bear its weight.
 """
 
 from __future__ import annotations
@@ -34,23 +35,25 @@ from shared.robot.fault_table import FALLEN_REMEDY
 from shared.robot.trip_table import limits_of
 
 AFTER_NS: Final = 150 * NS_PER_MS
-"""Two signs must agree for this long; a robot that is caught in time swings back sooner."""
+"""Two signs must be present for this time; a robot that is caught in time swings back sooner."""
 MOMENT_NS: Final = 500 * NS_PER_MS
-"""From tipping over an edge to the floor, a fall takes 0.5 to 0.8 s."""
+"""Time for which `tipped` and `whirled` remain signs; from the edge to the floor, a fall takes 0.5
+to 0.8 s."""
 TILT_MAX: Final = 0.5
 """rad; the robot stands on slopes up to 0.12, and its legs swing by 0.4 on a hoist."""
 WHIRL_MIN: Final = 0.5
 """rad/s"""
 APART_MAX: Final = (0.15, 0.3)
-"""m and rad; 0.03 m trips (`trips.legs`), and a stone under a sole makes 0.05 m."""
+"""m and rad; 0.1 m trips (`trips.legs`), and a stone under a sole causes 0.05 m."""
 ROLL_YAW_MAX: Final = (0.3, 0.5)
-"""rad; requests are 0.12 at most."""
+"""rad; requests are at most 0.12."""
 PITCH: Final = (-0.45, 1.6)
 """rad; a person leads from -0.1 to 1.2."""
 TIPPING: Final = 0.75
 """Fraction of half the sole; 1 is the edge, but measured torques lag as a sole tips."""
 BORNE: Final = 0.8
-"""Fraction of the weight; a hoist also tips the robot over an edge, but unloads it first."""
+"""Minimum fraction of the weight on the soles for `tipped`; a hoist also tips the robot over an
+edge, but unloads it first."""
 UNLOADED: Final = 0.45
 """Fraction of the weight."""
 
@@ -82,7 +85,7 @@ class FallState(msgspec.Struct):
     """State of `FallWatch`."""
 
     since_ns: int = 0
-    """Time since which two signs agree; 0 if they do not."""
+    """Time since which two signs are present; 0 if they are not."""
     tipped_ns: int = 0
     """Time at which a sole last tipped."""
     whirled_ns: int = 0
@@ -92,7 +95,7 @@ class FallState(msgspec.Struct):
     signs: str = ""
     """Signs that showed the fall, as text."""
     down: int = 0
-    """Bit i: module i has let go since the fall."""
+    """Bit i: module i has been in DAMP or FAULT since the fall."""
 
     def describe(self) -> str:
         """Return a message about the fall and its remedy; "" if there was no fall."""
@@ -102,10 +105,10 @@ class FallState(msgspec.Struct):
 
 
 class FallWatch:
-    """Detector of a fall: two of six signs must agree."""
+    """Detector of a fall: two of six signs must be present."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Set the weight; a robot whose trips are off, for studies, does not detect falls."""
+        """Set the weight; without trips, as in some studies, falls are not detected."""
         self._weight = config.total_mass * GRAVITY
         self._looks = math.isfinite(limits_of(config).legs.limit)
 
@@ -115,7 +118,7 @@ class FallWatch:
         Args:
             s: state of this watch; updated in place.
             now_ns: the planner's clock.
-            modes: modes of the six modules; without a stiff one, no fall is detected.
+            modes: modes of the six modules; unless one is HOLD or TRACK, no fall is detected.
             seen: measurements of this tick.
         """
         if s.fell_ns:
@@ -165,7 +168,7 @@ class FallWatch:
 
 
 def _is_rearmed(s: FallState, modes: Sequence[int]) -> bool:
-    """Return True, and forget the fall, once a module that had let go is stiff again."""
+    """Return True, and end the fall, once a module that was in DAMP or FAULT is stiff again."""
     for i, mode in enumerate(modes):
         if mode in _DOWN:
             s.down |= 1 << i

@@ -1,26 +1,26 @@
-"""Park: close height and pitch of a robot that stands still in a crouch, so a person rests. Pure.
+"""Park: closes height and pitch in a still crouch, so that a person can rest on the robot. Pure.
 
-With the height open, a person who rests f on the harness and one who leads down cause the same
-force and motion; no rule can tell them apart. So a robot that stands still in a working pose is
-parked: the law closes height and pitch where they are, and the assist A follows the rested weight.
+A robot that stands still in a working pose is parked (docs/law.md#park): the law closes height and
+pitch in place, and the assist A follows the rested weight.
 
     leads    the person leads height and pitch; A only falls
-    rests    parked:   A' = (rest - A) / FOLLOW_S + LIFTS (h - z)   within 0 and the pose's cap
+    rests    parked:   A' = (rest - A) / FOLLOW_S + LIFTS (h - z)   from 0 to the pose's cap
     away     parked, and nobody touches the harness
 
     rest = min(-f, -f + g (kg - kg_0))
 
-h is the closed height, z the measured one. Friction hides part of a load, and as the robot sinks
-the person's own legs take up another part. The dynamic certificate includes both terms
-(`tools.lab.design.dynamic_certificate`).
+h is the closed height, z the measured one. The term LIFTS (h - z) makes up for the part of a load
+that friction hides, and the part that the person's legs carry as the robot sinks. The dynamic
+certificate includes both terms (`tools.lab.design.dynamic_certificate`).
 
 f is the person's upward force, kg the estimated load beyond the robot file, and kg_0 its value at
-the first lead. A drifting sensor looks like a load that was taken off, and becomes no assist. Only
-a lasting net pull up, or a lasting moment backwards, opens height and pitch. Weight that is taken
-off looks like a pull against A, and must not open them. A request for assist wins: the robot then
-leads as with park off. An upright robot is never parked, so a squat starts as usual.
+the first lead. A drifting sensor looks like a load that was taken off, so it adds no assist. Only a
+lasting net pull up, or a lasting moment backwards, opens height and pitch. Weight that is taken off
+looks like a pull against A, and must not open them. A request for assist takes precedence: height
+and pitch are then open, as with park off. An upright robot is never parked, so a squat starts as
+usual.
 
-A shorter pull is a bump. A pull along the floor is reported, and changes nothing.
+A shorter pull or moment is a bump. A pull along the floor is only reported.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from shared.config.robot_config import GRAVITY
 from shared.config.sections import AssistConfig, ParkConfig
 
 BENT: Final = -1.25
-"""rad; theta of the straighter knee in a working pose. The other criterion is `PITCHED`."""
+"""rad; in a working pose, theta of the straighter knee is below this, or pitch above `PITCHED`."""
 PITCHED: Final = 0.3
 CAP: Final = (-0.4, -1.4)
-"""rad; theta of the straighter knee at which the cap on the assist is zero, and is full."""
+"""rad; theta of the straighter knee at which the assist's cap is zero, and at which it is full."""
 FOLLOW_S: Final = 0.2
-"""s; an ordinary shift of weight takes four times as long."""
+"""s; time constant of the assist. A person's ordinary shift of weight takes four times as long."""
 LIFTS: Final = 10_000.0
 """N/s of assist per metre below the closed height; at 1.5 times this, with `FOLLOW_S` of 0.3 s and
 twice the feedback, a motion grows."""
 SHED_RATE: Final = 400.0
 """N/s; maximum rate at which the assist falls. A person gets up from 150 N within half a second."""
 LASTS_NS: Final = 50 * NS_PER_MS
-"""Minimum duration of a force that opens; the shortest bump of a person is shorter."""
+"""Minimum duration of a pull or moment that opens height and pitch; a bump is shorter."""
 BUMPED_NS: Final = 300 * NS_PER_MS
 """Time for which a bump is reported."""
 AWAY: Final = (3.0, 1.0)
@@ -71,7 +71,7 @@ class ParkState(msgspec.Struct):
     away_ns: int = 0
     """Time since which the robot has been untouched; 0 while somebody touches it."""
     opens_ns: int = 0
-    """Time since which a force has acted to open height and pitch; 0 without such a force."""
+    """Time since which a force that can open height and pitch has acted; 0 without such a force."""
     pull_ns: int = 0
     """Time since which somebody has pulled along the floor; 0 without a pull."""
     bumped_ns: int = 0
@@ -83,7 +83,7 @@ class ParkState(msgspec.Struct):
         return self.wearing is not Wearing.LEADS
 
     def reported(self, now_ns: int) -> Wearing:
-        """Return the state to report; a pull and then a bump take precedence."""
+        """Return the state to report; a pull takes precedence, then a bump."""
         if self.pull_ns and now_ns - self.pull_ns >= PULL_NS:
             return Wearing.PULLS
         if self.bumped_ns and now_ns - self.bumped_ns < BUMPED_NS:
@@ -112,7 +112,6 @@ class ParkLaw:
     """Decision on parking, and the assist of a parked robot."""
 
     def __init__(self, park: ParkConfig, assist: AssistConfig) -> None:
-        """Set the thresholds and the maximum assist."""
         self.enabled = park.enabled
         self._open, self._open_back = park.open_n, park.open_back_nm
         self._still_ns = round(park.still_s * NS_PER_S)
@@ -121,7 +120,7 @@ class ParkLaw:
     def advance(
         self, s: ParkState, now_ns: int, touch: Touch | None, park: int, dt: float, *, may: bool
     ) -> float:
-        """Advance by one tick; return the requested assist, N.
+        """Advance by one tick; return the assist of a parked robot, N.
 
         Args:
             s: state of the park law; updated in place.
@@ -129,7 +128,8 @@ class ParkLaw:
             touch: forces and pose of this tick; None if unknown, which keeps the assist.
             park: requested `Park`.
             dt: time since the last tick, s.
-            may: the planner leads, nobody requests assist, and the person leads height and pitch.
+            may: True while the planner leads, nobody requests assist, and the robot does not move
+                on its own.
         """
         if touch is None:
             s.opens_ns = s.still_ns = s.away_ns = s.pull_ns = 0

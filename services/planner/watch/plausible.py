@@ -6,13 +6,13 @@
 support beyond the robot file and the wrench counts as load (`services.planner.law.load`). A load
 hardly ever changes while a person wears the robot, but a sensor can fail: a cell drifts, sticks or
 changes sign. From the first lead on, the load must therefore stay within `CHANGE_MAX` of its first
-value. In 40 drawn leads it changed by at most 1.0 kg and 2.3 N m, with persons who differ from
-their assist by 24 N.
+value. In 40 drawn leads it changed by at most 1.0 kg and 2.3 N m, although the persons' weight on
+the harness differed from the assist by 24 N.
 
-The planner ignores a distrusted wrench: it learns no load from it and does not ease the lead. The
-assist can no longer be checked, so it fades within `EASE_S`. A new zero (`xrl drive tare`) or a
-restart of the planner ends this. A load that somebody really added looks the same, and the text
-says so.
+The planner ignores a distrusted wrench: it does not estimate the load from it or ease the lead. The
+assist cannot be checked then, so it fades within `EASE_S`. A new zero (`xrl drive tare`) or a
+restart of the planner ends this. A load that a person really added looks the same, so the status
+text mentions that case.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SPEED_MAX: Final = 100.0
 TURN_MAX: Final = 100.0
 """rad/s, three times the range of the IMU in `docs/bring-up.md`; faster than any torso turns."""
 UNIT_ERROR: Final = 0.1
-"""Maximum deviation of a direction's length from 1."""
+"""Maximum deviation of the length of `up` from 1."""
 N_CELLS: Final = 6
 
 
@@ -84,19 +84,19 @@ class Plausible:
 CHANGE_MAX: Final = (3.0, 7.0)
 """Maximum change of the load, kg and N m."""
 AFTER_S: Final = 0.5
-"""Time after which such a change counts, s: a robot that trips and holds swings for a moment."""
+"""Time after which a larger change counts, s: a robot that trips and holds swings for a moment."""
 EASE_S: Final = 10.0
-"""Time in which the whole assist fades out or in, s: 20 N/s for the full one."""
+"""Time in which the whole assist fades out or in, s: 20 N/s for the maximum of 200 N."""
 
 
 class HarnessTrust(msgspec.Struct):
-    """Comparison of the load with that of the first lead."""
+    """Comparison of the load with its value at the first lead."""
 
     load: Vector3 = (0.0, 0.0, 0.0)
     """kg, a and b (N m) of the load when the planner first led."""
     has_led: bool = False
     beyond_s: float = 0.0
-    """Time for which the load has differed from that one, s."""
+    """Time for which the load has been beyond `CHANGE_MAX`, s."""
     change: Vector3 = (0.0, 0.0, 0.0)
     """Change of the load when the wrench was first distrusted; units as in `load`."""
     doubted: bool = False
@@ -107,7 +107,7 @@ class HarnessTrust(msgspec.Struct):
         """Advance by one tick; return the fraction of the requested assist that remains.
 
         Args:
-            load: estimated load; reset to that of the first lead when the wrench is first
+            load: estimated load; reset to that of the first lead when the wrench becomes
                 distrusted.
             tare: `Tare` of the newest wrench.
             dt: time since the last tick, s.

@@ -1,16 +1,8 @@
 """Actions before a motor overheats or a battery is empty. Pure.
 
 **Heat** (docs/law.md#heat). Each joint service reports the seconds left at its present load. The
-least of them decides:
-
-    below heat.ease_s     warn the wearer, and ramp the assist down to the weight that the wearer
-                          rests on the robot
-    below heat.stand_s    close height and pitch, and stand up slowly to nearly straight knees,
-                          where holding a pose costs least
-    straight              stay straight for at least `REST_S`, until `RELEASE` times ease_s are
-                          left, and while a hand presses or pulls: an open height would follow it
-
-Without a planner the modules hold, and only report the heat.
+shortest time decides whether the assist ramps down, and whether the robot stands up to nearly
+straight knees, where holding a pose costs least.
 
 **Supply.** The planner warns early of a low battery:
 
@@ -19,8 +11,9 @@ Without a planner the modules hold, and only report the heat.
 
 A supply without power makes its modules limp, and the robot falls: from its lowest pose as hard as
 from a stand. The early lowering leaves time to put a stand under the torso. The lowest of the six
-supplies counts, low-passed, because a step of the load is not an empty battery. Both states last
-until the supply is `RECOVERED_V` above their level, because a battery recovers once its load falls.
+supplies counts, low-passed, because a voltage step under load does not mean an empty battery. Both
+states last until the supply is `RECOVERED_V` above their level, because a battery recovers once its
+load falls.
 """
 
 from __future__ import annotations
@@ -38,35 +31,36 @@ from shared.config.sections import HeatConfig, SupplyConfig
 from shared.joints import MODULES, kind_of
 
 EASE_S: Final = 10.0
-"""Time in which the whole assist fades if nobody rests on it, s: 20 N/s for the full one."""
+"""Time in which the whole assist fades if nobody rests on it, s: 20 N/s for the maximum of 200
+N."""
 SHED_RATE: Final = 5.0
 """Maximum rate at which the assist follows a person who takes weight off, N/s."""
 RESTED_ON: Final = 5.0
-"""N; the assist stays above the weight rested on it minus this. Dry friction hides 6 N."""
+"""N; the assist stays above the weight on the harness minus this. Dry friction hides 6 N."""
 STRAIGHT: Final = -0.4
 """rad, theta of the knees; their soft stop is at -0.2, and a straight knee is singular."""
 SLACK: Final = 0.15
-"""rad by which a knee bends again before the robot resumes standing up."""
+"""rad; if a knee bends again by this, the robot resumes standing up."""
 REST_S: Final = 20.0
 """Minimum time for which the robot stays straight, s."""
 RELEASE: Final = 2.0
 """Multiple of heat.ease_s that must be left before the height opens again."""
 HAND_MAX: Final = 30.0
-"""N beyond the assist, either way; a stronger hand keeps the height closed. When it opened under
-150 N, a robot dropped from 1.29 to 0.95 m within a second."""
+"""N beyond the assist, either way; a stronger hand keeps the height closed. A robot whose height
+opened under 150 N dropped from 1.29 to 0.95 m within a second."""
 ASSIST_AGAIN: Final = 10.0
-"""Multiple of heat.ease_s that must be left before the assist returns. With less it would come and
-go, because the load is light without it."""
+"""Multiple of heat.ease_s that must be left before the assist returns. With less, the assist would
+come and go, because the load is light without it."""
 _KNEES: Final = tuple(i for i, name in enumerate(MODULES) if kind_of(name) == "knee")
 
 
 class HeatDecision(NamedTuple):
-    """Action of a tick against the heat."""
+    """Action against the heat in one tick."""
 
     assist: float
     """Assist to request from the law, N."""
     toward: Toward
-    """Where the robot moves on its own."""
+    """Direction in which the robot moves on its own."""
 
 
 class HeatWatchState(msgspec.Struct):
@@ -80,7 +74,7 @@ class HeatWatchState(msgspec.Struct):
     rests: float = 0.0
     """Weight that the person rests on the robot, N; falls at most at `SHED_RATE`."""
     left_s: float = -1.0
-    """Least time of all modules, s; -1 if no module reports one."""
+    """Shortest of the modules' times left, s; -1 if no module reports one."""
     lifted: float | None = None
     """Upward force of the person on the robot in the last tick, N; None if unknown."""
     hottest: int = 0
@@ -140,11 +134,11 @@ class HeatWatch:
             return ""
         name = MODULES[s.hottest]
         if s.action is HeatAction.RESTS and s.left_s < self._ease_s:
-            return (
-                f"{name} is hot, {s.left_s:.0f} s left even if straight: reduce the load or hang it"
-            )
+            left = f"{s.left_s:.0f} s left even on straight legs"
+            return f"{name} is hot, {left}: unload or hang the robot"
         if s.action is HeatAction.RESTS:
-            return f"{name} was hot: it stays straight until it is cool and no hand presses it"
+            until = "the module has cooled, and no hand presses or pulls"
+            return f"{name} was hot: the robot stays straight until {until}"
         words = "stand up, or take weight off; the assist ramps down"
         if s.action is HeatAction.STANDS_UP:
             words = "the robot stands up on its own; let it"
@@ -168,7 +162,6 @@ class HeatWatch:
 
 
 def _assist_left(s: HeatWatchState, requested: float) -> float:
-    """Return the remaining part of the requested assist, N."""
     if s.scale >= 1.0:
         return requested
     return min(requested, max(s.scale * requested, s.rests - RESTED_ON))
@@ -187,8 +180,8 @@ class SupplyState(msgspec.Struct):
     module: str = ""
     """Module of the lowest supply."""
     was_well: bool = False
-    """True once the supply was above `supply.low_v`. A battery that never was is not the one in the
-    robot file, and moves nothing."""
+    """True once the supply was above `supply.low_v`. A battery that was never above it is not the
+    one that the robot file describes, so it does not lower the robot."""
     low: bool = False
     sits: bool = False
 
@@ -219,15 +212,18 @@ class SupplyWatch:
         s.sits = s.was_well and s.volts < self._sit_v + (RECOVERED_V if s.sits else 0.0)
 
     def describe(self, s: SupplyState) -> str:
-        """Return a warning for the wearer; "" if the supplies are well."""
+        """Return a warning for the wearer; "" if no supply is low."""
         if s.sits:
             return (
-                f"the supply of {s.module} is at {s.volts:.1f} V, below {self._sit_v:g} V: the "
+                f"the supply of {s.module} is at {s.volts:.1f} V (limit {self._sit_v:g} V): the "
                 "robot goes down; hang it, or put a stand under its torso, now"
             )
         if s.low:
+            goes = ""
+            if self._sit_v and s.was_well:
+                goes = f"; at {self._sit_v:g} V the robot goes down on its own"
             return (
-                f"the supply of {s.module} is at {s.volts:.1f} V, below {self._low_v:g} V: change "
-                f"the battery; at {self._sit_v:g} V the robot goes down on its own"
+                f"the supply of {s.module} is at {s.volts:.1f} V (limit {self._low_v:g} V): change "
+                f"the battery{goes}"
             )
         return ""

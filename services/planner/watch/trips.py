@@ -7,24 +7,25 @@ A trip makes all six modules hold. No single joint service can detect these faul
     reach      the inverse kinematics does not reach the reference pose
     tracking   a joint is far from its reference
     unloaded   a sole bears almost no load (`services.planner.law.feet.Soles`)
-    sinking    the COM moves faster than a person leads
+    sinking    the COM sinks or rises faster than a person leads
     turning    the torso turns faster than a person leads
     harness    the force on the person differs from the request by too much
     sagging    the person presses the robot down harder than a lead does: power of the load beyond
                assist and lead, while it sinks
     unattended the robot drifts without a hand on it (`services.planner.watch.unattended`)
     edge       a sole's centre of pressure is near its edge (`services.planner.law.feet.Soles`)
-    tipping    the same at the edge, with a shorter delay: a shove of 110 N for 0.3 s, on the way
-               into the crawl, tipped the sole before `edge` counted
+    tipping    a sole's centre of pressure is at its edge; the delay is shorter than that of `edge`,
+               because a shove of 110 N for 0.3 s, on the way into the crawl, tipped the sole before
+               `edge` tripped
     balance    the COM is ahead of or behind its reference. References that drift consistently with
                their rates can take it there, and no joint service can detect that
 
 The planner checks the trips while it is engaged. `unloaded` counts only once both legs have carried
 the torso, because on a hoist neither does. `sagging` counts only once the person has stopped
-pressing, because a hand held up in HOLD first catches up. HOLD may leave the COM off its reference,
-and the leading planner brings it back, so `balance` counts only an offset that grows by `ROOM`.
-A trip ends when every value has been within its limit for `CALM_NS` and the tripped value was known
-throughout: a silent harness does not end a trip on its force. A trip counts as a dropout
+pressing, because a hand that HOLD held up first catches up. HOLD may leave the COM off its
+reference, and the leading planner brings it back, so `balance` counts only an offset that grows by
+`ROOM`. A trip ends when every value has been within its limit for `CALM_NS` and the tripped value
+was known throughout: a silent harness does not end a trip on its force. A trip counts as a dropout
 (`services.planner.watch.engagement_fsm`): after repeated trips the planner waits ever longer before
 it re-engages.
 """
@@ -44,15 +45,17 @@ from shared.config.robot_config import RobotConfig
 from shared.robot.trip_table import PLANNER_TRIPS, limits_of
 
 CALM_NS: Final = NS_PER_S
-"""A body that still swings passes through its limits several times a second."""
+"""Time within all limits that ends a trip. A body that still swings passes through its limits
+several times a second."""
 LEADING_LOAD: Final = 40.0
-"""N; force of a hand that leads down, by 0.4 m in 2 s."""
+"""N; force of a hand that leads the robot down by 0.4 m in 2 s."""
 ASSUMED_SINK_RATE: Final = 1.0
-"""m/s; rate at which a load beyond that would sink if the planner engaged again."""
+"""m/s; assumed sink rate of a load beyond `LEADING_LOAD` if the planner engaged again."""
 SINK_RATE_MIN: Final = 1e-3
 """m/s; minimum sink rate, used for a robot that does not sink."""
 ROOM: Final = 0.02
-"""m; a COM beyond the limit trips only if its offset is this much above its minimum while led."""
+"""m; a COM beyond the limit trips only if its offset is this much above its minimum since
+engaging."""
 LOADED_FACTOR: Final = 3.0
 """Multiple of the `unloaded` limit; a robot stands if both legs carry this load."""
 
@@ -74,9 +77,9 @@ class TripsState(msgspec.Struct):
     why: str = ""
     """Text of the trip, with value and limit at its time."""
     stands: bool = False
-    """Both legs have carried the torso since the planner engaged."""
+    """True once both legs have carried the torso since the planner engaged."""
     light: bool = False
-    """The person has stopped pressing on the robot since the planner engaged."""
+    """True once the person has stopped pressing on the robot since the planner engaged."""
     off: float = -1.0
     """Minimum offset of the COM since the planner engaged, m; -1 while it does not lead."""
 
@@ -100,7 +103,7 @@ class PlannerTrips:
             state: state of these trips; updated in place.
             now_ns: the planner's clock.
             values: result of `values_of`; NaN is unknown and never trips.
-            leads: True while the planner is engaged; only then it trips.
+            leads: True while the planner is engaged; only then does it trip.
         """
         loaded = values[_UNLOADED] > LOADED_FACTOR * self._limits[_UNLOADED]
         state.stands = (leads or state.tripped > 0) and (state.stands or loaded)
@@ -158,7 +161,7 @@ def values_of(
         harness_rate: vertical rate of the harness point, m/s, world.
         drift: drift without a hand on the robot, m.
         leads: True while the planner is engaged.
-        moves: True while height and pitch are closed for heat, so sagging and drift are 0.
+        moves: True while height and pitch are closed for heat; sagging and drift are then 0.
     """
     x, y, z = output.closure[:3].tolist()
     error = output.q_ref - q
@@ -192,7 +195,7 @@ def _assist_error(lifted: float | None, assist: float, *, leads: bool) -> float:
 def _pressing_power(lifted: float | None, assist: float, rate: float, *, leads: bool) -> float:
     """Return the power with which the person presses the robot down, W; NaN if unknown.
 
-    It is zero exactly for loads up to that of a lead. In HOLD nothing sinks, so the power is that
+    It is exactly zero for loads up to `LEADING_LOAD`. In HOLD nothing sinks, so the power is that
     of the load at `ASSUMED_SINK_RATE`.
     """
     if lifted is None:

@@ -2,21 +2,21 @@
 
 Height and pitch are open: only the wearer's hand holds them. Without a hand, an error of the
 feedforward or weight on the harness accelerates the robot: a torso turned by 0.8 rad within a
-second of its release. The weight of a resting person does not count as a hand. The hand along z is
-the force beyond the assist; the hand about pitch is the moment alone.
+second of its release. The weight of a resting person does not count as a hand. Along z, the hand's
+force is the force beyond the assist; about pitch, the hand's moment is the whole moment.
 
 Without a hand, friction must brake each direction and nothing may drive it. The watch therefore
-compares the rate with c, the rate at which the hand left. c decays with `COAST_S` or faster:
+compares the rate with c, the rate when the hand left. c decays with `COAST_S` or faster:
 
-    c        = rate, clamped between 0 and the last c;  c = rate while a hand is felt
-    excess'  = rate - c;                           excess = 0 while a hand is felt
+    c        = rate, clamped between 0 and the last c;  c = rate while a hand is detected
+    excess'  = rate - c;                           excess = 0 while a hand is detected
     released   if |excess + STOP_S (rate - c)| > RUNAWAY
 
 A released direction is closed (`services.planner.law.closed_reference`) until a hand returns. If a
-hand was there after all, too light to be felt, it meets a resistance and opens the direction. A
+hand was there after all, too light to be detected, it meets a resistance and opens the direction. A
 pitch that stays released for `PROOF_NS` shows that nobody holds the robot. The height is then
-closed too, so the weight of a resting person no longer moves it. A hand on the pitch opens both.
-Any further motion is drift, which trips:
+closed too, so that the weight of a resting person cannot move it. A hand on the pitch opens both.
+Further motion is drift, which trips:
 
     drift    = max(|z - z0|, ARM |pitch - pitch0|)       z0, pitch0: when the hand was lost
 """
@@ -34,15 +34,15 @@ from shared.clamp import clamp
 from shared.clock import NS_PER_MS, NS_PER_S
 
 HAND_MIN: Final = (3.0, 1.0)
-"""N and N m; noise and zero errors are smaller, a leading hand is stronger (dry friction alone
+"""N and N m; noise and zero offsets are smaller, a leading hand is stronger (dry friction alone
 takes 6 N)."""
 TOUCH_MIN: Final = (3.0, 0.25)
-"""N and N m; twice the noise. In 6 of 31 drawn leads, a hand that guided a torso driven by the
-feedforward needed less than 1 N m for seconds."""
+"""N and N m; twice the noise. In 6 of 31 drawn leads, the feedforward drove the torso, and the hand
+that guided it needed less than 1 N m for seconds."""
 COAST_S: Final = 0.5
-"""Time constant, s; friction stops a torso of 0.4 rad/s, led and then left, in 0.3 s."""
+"""Time constant of c, s. Friction stops a torso 0.3 s after a hand leaves it at 0.4 rad/s."""
 HAND_LOST_NS: Final = NS_PER_S // 2
-"""ns; while friction helps a hand to brake the robot, the hand is not felt for up to 0.3 s."""
+"""ns; while friction helps a hand to brake the robot, the hand is not detected for up to 0.3 s."""
 ARM: Final = 0.25
 """m per rad of the torso's pitch."""
 RUNAWAY: Final = (0.0075, 0.04)
@@ -51,19 +51,19 @@ STOP_S: Final = 0.1
 """s; the closed directions stop a drift of 1 rad/s within 0.1 rad."""
 HAND_BACK: Final = (25.0, 1.0)
 """N and N m; a stronger hand opens a released direction. A person who rests on the robot requests
-an assist, and differs from it by at most 24 N."""
+an assist, which differs from the weight on the harness by at most 24 N."""
 HAND_BACK_NS: Final = 50 * NS_PER_MS
-"""ns; a bump is shorter."""
+"""ns; minimum duration of a force that opens a released direction; a bump is shorter."""
 PROOF_NS: Final = 120 * NS_PER_MS
-"""ns; most hands that lead the pitch are felt sooner. In 5 of 60 drawn leads the hand was not felt,
-and its peak force rose by 5 to 32 N."""
+"""ns; most hands that lead the pitch are detected sooner. In 5 of 60 drawn leads the hand was not
+detected, and its peak force rose by 5 to 32 N."""
 
 
 class _OpenDirection(msgspec.Struct):
     """State of one open direction, in m or rad."""
 
     coast: float = 0.0
-    """c, the decaying rate at which the hand left, m/s or rad/s."""
+    """c, the rate when the hand left, decaying, m/s or rad/s."""
     excess: float = 0.0
     drive: float = 0.0
     """Acceleration at the release, m/s^2 or rad/s^2."""
@@ -74,10 +74,10 @@ class _OpenDirection(msgspec.Struct):
 
 
 class Unattended(msgspec.Struct):
-    """Watch over height and pitch, with the pose in which a hand was last felt."""
+    """Watch over height and pitch, with the pose in which a hand was last detected."""
 
     felt_ns: int = 0
-    """Time at which a hand was last felt."""
+    """Time at which a hand was last detected."""
     left: Pair | None = None
     """Pose in which the hand left the robot: COM height, m, and torso pitch, rad."""
     last_ns: int = 0

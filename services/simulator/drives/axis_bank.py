@@ -1,10 +1,10 @@
 """Twelve emulated ODrive axes: state machine, watchdogs, checks and errors (docs/drives.md).
 
-Firmware 0.5.6, with its traps. OVERSPEED disarms in torque mode too. A disarmed axis floats while
-its sibling keeps its torque. The watchdog runs in IDLE too. Re-arming does not zero `input_torque`.
-Setting a mode moves `input_pos` to the motor. An axis can be in IDLE with `axis_error` 0. An axis
-that reads no encoder stays armed and blind for 51 ms and misses the turns made meanwhile. A restart
-restores the saved settings.
+It emulates firmware 0.5.6 with its traps. OVERSPEED disarms in torque mode too. A disarmed axis
+floats while its sibling keeps its torque. The watchdog runs in IDLE too. Re-arming does not zero
+`input_torque`. Setting position mode moves `input_pos` to the motor's position. An axis can be in
+IDLE with `axis_error` 0. An axis whose encoder fails stays armed for 51 ms and misses the turns
+made meanwhile. A restart restores the saved settings.
 
 Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
 Units at the motor: turns, turn/s, N m, A.
@@ -52,9 +52,9 @@ __all__ = ["AXIS_NAMES", "FAULTS", "AxisBank", "AxisErrors"]
 Vector = NDArray[np.float64]
 
 REFUSED_S: Final = 1e-3
-"""s; time in closed loop without torque for an axis with an error or without a phase."""
+"""Time in closed loop without torque for an axis with an error or without a phase, s."""
 REARM_S: Final = 0.25e-3
-"""s; gap in the torque of an armed axis when closed loop is requested again."""
+"""Gap in the torque of an armed axis when closed loop is requested again, s."""
 _EARLY_S: Final = 1e-6
 
 
@@ -126,10 +126,10 @@ class AxisBank:
         return bool(self.calibration.running) or self._control.regulates()
 
     def step(self, now_s: float, pos_turns: Vector, vel_turns: Vector) -> Vector:
-        """Advance to `now_s`: true motor position and velocity in, motor torque out.
+        """Advance to `now_s`; return the motor torques for true motor positions and velocities.
 
         The first call sets the clock, feeds the watchdogs and starts the estimators at
-        the true values. The array returned is overwritten by the next step.
+        the true values. The next step overwrites the returned array.
         """
         control = self._control
         if self.now_s == -math.inf:
@@ -168,17 +168,17 @@ class AxisBank:
     # ---- requests of a front
 
     def feed(self, *axes: int) -> None:
-        """Feed the watchdogs of axes, as any CAN frame to one does."""
+        """Feed the watchdogs of axes, as any CAN frame to an axis does."""
         for axis in axes:
             self._watchdogs.feed(axis, self.now_s)
 
     def request_state(self, axis: int, state: int) -> None:
         """Request a state: IDLE, CLOSED_LOOP_CONTROL or a calibration; only its low byte counts.
 
-        With any error, or without the encoder's calibration, closed loop lasts for 1 ms without
-        torque. Closed loop without the motor's calibration, an encoder's calibration before its
-        motor's, and any other state set INVALID_STATE and lead to IDLE. An axis that does not run
-        yet executes the request once it runs.
+        With an axis error, or without the encoder's calibration, closed loop lasts for 1 ms without
+        torque. Three requests set INVALID_STATE and lead to IDLE: closed loop without the motor's
+        calibration or the encoder's direction, an encoder's calibration before its motor's, and any
+        other state. An axis that is still booting executes the request once it runs.
         """
         drive, state = axis >> 1, state & 0xFF
         if state == AxisState.UNDEFINED:
@@ -208,9 +208,9 @@ class AxisBank:
             self._fail(axis, AxisErrors(AxisError.INVALID_STATE))
 
     def set_modes(self, axis: int, control_mode: int, input_mode: int) -> None:
-        """Set the controller's modes; only PASSTHROUGH is emulated, others are an error.
+        """Set the controller's modes; an input mode other than PASSTHROUGH is an error.
 
-        Position mode sets `input_pos` to the motor's position, even if it was on already.
+        Position mode sets `input_pos` to the motor's position, even if it was already active.
         """
         control_mode, input_mode = control_mode & 0xFF, input_mode & 0xFF
         if input_mode != InputMode.PASSTHROUGH or control_mode not in (1, 2, 3):
@@ -222,24 +222,24 @@ class AxisBank:
         self._control.hold_here(axis)
 
     def set_count(self, axis: int, count: float) -> None:
-        """Set an axis's count at its present position; `input_pos` stays."""
+        """Set an axis's count at its present position; `input_pos` is unchanged."""
         self._encoders.set_count(axis, count)
 
     def clear_errors(self, axis: int) -> None:
-        """Clear all errors of the axis's ODrive: the firmware clears both axes.
+        """Clear the errors of both axes of the ODrive, as the firmware does.
 
-        A lasting cause (heat, the bus) sets its error again at the next step. Missing words of an
-        encoder do so only after 51 ms, because their filter is emptied.
+        A lasting cause (heat, DC bus) sets its error again at the next step. Missing encoder words
+        do so only after 51 ms, because their filter is reset.
         """
         for each in _both(axis):
             self.faults[each] = AxisErrors()
             self._encoders.clear_errors(each)
 
     def set_error(self, axis: int, register: str, error: int) -> None:
-        """Write an error register by its name in `AxisErrors`, as over USB, where all are writable.
+        """Write an error register by its name in `AxisErrors`, as is possible over USB.
 
-        An error in the axis's own register disarms it, as if it had occurred. The filter of an
-        encoder's missing words, and the sibling, are unchanged.
+        An error in the `axis` register disarms the axis, as if it had occurred. The filter of
+        missing encoder words, and the sibling, are unchanged.
         """
         self.faults[axis] = self.faults[axis]._replace(**{register: error})
         if self.faults[axis].axis:
@@ -252,9 +252,9 @@ class AxisBank:
     def reboot(self, axis: int) -> None:
         """Restart the axis's ODrive.
 
-        Both axes float, inputs are zero, errors are cleared, settings are as saved. The ODrive is
-        silent for `TALKS_S`. From then on it answers, in state 0, and until `BOOT_S` it stores the
-        last requested state.
+        Both axes float, inputs become zero, errors are cleared, and the saved settings return. The
+        ODrive is silent for `TALKS_S`, then answers in state 0. Until `BOOT_S` it stores the last
+        requested state.
         """
         drive = axis >> 1
         for each in _both(axis):
@@ -273,7 +273,7 @@ class AxisBank:
         self.conditions.boot(drive, self.now_s)
 
     def is_responding(self, axis: int) -> bool:
-        """Return True if the axis's ODrive communicates: powered, started, plugged in."""
+        """Return True if the axis's ODrive is powered, started and plugged in."""
         return axis not in self.conditions.silent
 
     def heartbeat(self, axis: int) -> Heartbeat:
@@ -291,7 +291,7 @@ class AxisBank:
     # ---- faults and supply
 
     def inject(self, axis: str, error: str) -> None:
-        """Fault an axis, by its name in `AXIS_NAMES` and the fault's name in `FAULTS`.
+        """Inject a fault of `FAULTS` into an axis of `AXIS_NAMES`, both by name.
 
         Raises:
             DriveError: the axis or the fault is unknown.
@@ -305,7 +305,7 @@ class AxisBank:
             self._fail(each, FAULTS[error])
 
     def supply(self, drive: int, volts: float) -> None:
-        """Set an ODrive's supply voltage; below `DEAD_VOLTAGE` it is off, above it boots again."""
+        """Set an ODrive's supply voltage; it is off below `DEAD_VOLTAGE`, and boots above it."""
         self.bus.supply[drive] = volts
         self.bus.changed()
         if volts < DEAD_VOLTAGE:
@@ -319,7 +319,7 @@ class AxisBank:
     # ---- within a step
 
     def _apply_conditions(self) -> None:
-        """Handle rare changes: drives that start, conditions, calibrations."""
+        """Handle booting drives, lasting conditions and calibrations."""
         for drive in self.conditions.finish_boots(self.now_s):
             for axis in _both(2 * drive):
                 self.state[axis] = AxisState.IDLE
@@ -333,7 +333,7 @@ class AxisBank:
             self._become(axis, self.calibration.advance(axis, self.now_s))
 
     def _check_odd_encoders(self) -> None:
-        """Check speeds within the step; an estimate that is valid again ends its error."""
+        """Clear the error of an estimate that is valid again, and check speeds within the step."""
         for axis, odd in self._encoders.odd.items():
             fault = self.faults[axis]
             if fault.controller & ControllerError.INVALID_ESTIMATE and not odd.fails:
@@ -344,7 +344,7 @@ class AxisBank:
                 self._fail(axis, FAULTS["OVERSPEED"])
 
     def _end_closed_loops(self) -> None:
-        """End the states of refused closed loops, and check disarmed axes for a spinout."""
+        """End refused closed loops when due, and check disarmed axes for a spinout."""
         for axis, until_s in list(self._refused_s.items()):
             if until_s <= self.now_s + _EARLY_S:
                 del self._refused_s[axis]
@@ -356,9 +356,9 @@ class AxisBank:
             self._fail(axis, FAULTS["SPINOUT"])
 
     def _at_shafts(self) -> Vector:
-        """Return the torques at the shafts, where a blind rotor is driven off phase.
+        """Return the torques at the shafts, reduced where the drive's rotor angle is wrong.
 
-        An armed axis that is armed again gives no torque for a quarter of a millisecond.
+        An armed axis that is armed again gives no torque for `REARM_S`.
         """
         self._shaft[:] = self.torque
         self._encoders.commutate(self._shaft)
@@ -377,8 +377,8 @@ class AxisBank:
     def _arm(self, axis: int) -> None:
         """Enter closed loop; as in the firmware, `input_torque` is unchanged.
 
-        Without a phase, or with an error, the state lasts only while the firmware's thread sleeps.
-        The target still moves to the motor's position.
+        Without a phase, or with an error, the state lasts only for one sleep of the firmware's
+        thread. The target still moves to the motor's position.
         """
         if self._control.armed[axis]:
             self._rearmed.add(axis)
@@ -405,7 +405,7 @@ class AxisBank:
         self.torque[axis] = 0.0
 
     def _fail(self, axis: int, fault: AxisErrors) -> None:
-        """Latch a fault and disarm this axis alone; a drive that is down has no registers."""
+        """Latch a fault and disarm only this axis; no effect while its drive is down."""
         if axis >> 1 in self.conditions.down:
             return
         if not self._control.armed[axis]:
@@ -416,6 +416,5 @@ class AxisBank:
 
 
 def _both(axis: int) -> tuple[int, int]:
-    """Return both axes of the ODrive that an axis belongs to."""
     first = axis & ~1
     return first, first + 1

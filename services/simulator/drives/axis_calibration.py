@@ -1,14 +1,14 @@
 """Calibration of the emulated axes: its state and its procedures (docs/drives.md).
 
-Firmware 0.5.6, `Motor::run_calibration` and `Encoder::run_offset_calibration`. The drive turns a
-field, and the rotor follows as in a synchronous motor: the torque is that of the current times the
-sine of the electrical lag. A shaft that is blocked, or loaded beyond that torque, does not follow,
-and the drive detects that by its encoder's count.
+It emulates `Motor::run_calibration` and `Encoder::run_offset_calibration` of firmware 0.5.6. The
+drive turns a field, and the rotor follows as in a synchronous motor, with a torque proportional to
+the current and to the sine of the electrical lag. A shaft that is blocked, or loaded beyond that
+torque, does not follow, and the drive detects that by its encoder's count.
 
-Emulated traps: an encoder's calibration forgets the turns when it starts. A request for IDLE in the
-second part of the motor's calibration, or on the encoder's way back, leaves the axis calibrated by
-half a measurement. Without a current a resistance is NaN, and `save_configuration` keeps it. With a
-latched error, nothing is measured and no error is added.
+Emulated traps: an encoder's calibration discards the turns when it starts. A request for IDLE in
+the second part of the motor's calibration, or on the encoder's way back, leaves the axis calibrated
+from half a measurement. If the current is not reached, the resistance is NaN, and
+`save_configuration` stores it. With a latched error, nothing is measured and no error is added.
 """
 
 from __future__ import annotations
@@ -33,20 +33,23 @@ from shared.joints import N_JOINTS
 
 RESISTANCE_S: Final = 3.0
 INDUCTANCE_S: Final = 1.25
-"""Durations of the two parts of the motor's calibration."""
+"""Durations of the two parts of the motor's calibration, s."""
 LOCK_S: Final = 1.0
-"""First part of the encoder's: the field stands still, and its current rises in the first half."""
+"""Duration of the first part of the encoder's calibration, s: the field stands still, and its
+current rises in the first half."""
 RESPONSE_COUNTS: Final = 8
-"""An encoder that counts at most this on the way out has not responded."""
+"""An encoder that moves by at most this many counts on the way out has not responded."""
 VOLTAGE_GAIN: Final = 1.0
-"""V/s per A of missing test current."""
+"""Rate of the test voltage, V/s, per A of missing test current."""
 LEAD_S: Final = 0.0015
-"""Delay of a torque in the world, by the hold of a step and the current loop's lag. The field's
-torque follows the angle at once; a late torque would shake the rotor out of step."""
+"""Delay of a torque in the world, s: a step holds it, and the current loop lags. The real field's
+torque follows the angle at once. The emulation extrapolates the angle by this time, because a late
+torque would shake the rotor out of step."""
 BRAKING: Final = 0.05
-"""Fraction of short-circuit braking that a current loop of 1000 rad/s leaves at a rotor's 30 Hz."""
+"""Fraction of short-circuit braking that a current loop of 1000 rad/s leaves for a rotor that
+oscillates at 30 Hz."""
 CURRENT_MARGIN: Final = 8.0
-"""A beyond `current_lim` at which the drive disarms; the default."""
+"""Excess over `current_lim` at which the drive disarms, A; the firmware's default."""
 
 SEQUENCES: Final = {
     AxisState.FULL_CALIBRATION_SEQUENCE: (
@@ -90,7 +93,7 @@ class Calibration:
         motor: `motor.is_calibrated` of each axis.
         encoder: `encoder.is_ready` of each axis.
         running: running calibrations, by axis.
-        response: counts of each encoder's last way out; 0 if none since the start.
+        response: counts by which each encoder moved on its last way out; 0 before the first.
         resistance: true phase resistance of each motor, ohm; large for a broken wire.
     """
 
@@ -107,7 +110,7 @@ class Calibration:
             self.restart(axis)
 
     def restart(self, axis: int) -> None:
-        """Reset an axis's calibration to what its settings keep."""
+        """Reset an axis's calibration to its `pre_calibrated` settings."""
         self.running.pop(axis, None)
         self.response[axis] = 0.0
         self.motor[axis] = self._setting(axis, "motor.config.pre_calibrated") > 0.0
@@ -128,13 +131,13 @@ class Calibration:
         return self.motor[axis] and self.encoder[axis]
 
     def refuses(self, axis: int) -> bool:
-        """Return True if closed loop is refused; without a ready encoder it starts and ends."""
+        """Return True if closed loop is refused; without a ready encoder it starts, then ends."""
         return not self.motor[axis] or self._setting(axis, "encoder.config.direction") == 0.0
 
     def begin(
         self, axis: int, states: tuple[AxisState, ...], now_s: float, *, latched: bool = False
     ) -> AxisState | AxisErrors:
-        """Start the first of the states; return it, IDLE without states, or the errors.
+        """Start the first of the states; return it, IDLE if there are none, or the errors.
 
         A `latched` error disarms the axis in the first cycle.
         """
@@ -191,8 +194,8 @@ class Calibration:
         """Return the torque on the shaft of an axis that calibrates, N m.
 
         The motor's calibration sets voltages, so its windings brake the rotor as if they were
-        short-circuited. The encoder's calibration sets currents, whose loop leaves `BRAKING` of
-        that. `pos_turns` and `vel_turns`, turn/s, are the rotor's true position and speed.
+        short-circuited. The encoder's calibration sets currents, whose loop reduces the braking to
+        `BRAKING`. `pos_turns` and `vel_turns`, turn/s, are the rotor's true position and speed.
         """
         task, constant = self.running[axis], self._torque_constant
         ahead = pos_turns + LEAD_S * vel_turns
@@ -202,10 +205,10 @@ class Calibration:
         braking *= 1.0 if task.state == _MOTOR else BRAKING
         return float(torque - braking * 2.0 * math.pi * vel_turns)
 
-    # ---- procedures: None while running, then their errors, `_NONE` after success
+    # ---- procedures: they return None while running, then errors, or `_NONE` after success
 
     def _measure(self, axis: int, task: _Task, elapsed_s: float) -> AxisErrors | None:
-        """Raise a standing current to its setpoint, then oscillate it."""
+        """Raise a direct current to its setpoint, then oscillate the current."""
         if task.stage == 0:
             ohm = float(self.resistance[axis])
             asked = self._setting(axis, "motor.config.calibration_current")
@@ -228,7 +231,7 @@ class Calibration:
         return None
 
     def _scan(self, axis: int, task: _Task, elapsed_s: float) -> AxisErrors | None:
-        """Lock the rotor, lead it some electrical turns out, and back."""
+        """Lock the rotor, turn it some electrical turns out, and back."""
         asked = self._setting(axis, "motor.config.calibration_current")
         task.current = asked * min(1.0, 2.0 * elapsed_s / LOCK_S)
         if error := self._too_much(axis, task.current):
@@ -269,7 +272,6 @@ class Calibration:
         return _NONE
 
     def _too_much(self, axis: int, current: float) -> AxisErrors | None:
-        """Return an error if the field's current exceeds the drive's limit."""
         if current <= self._setting(axis, "motor.config.current_lim") + CURRENT_MARGIN:
             return None
         return motor_fault(MotorError.CURRENT_LIMIT_VIOLATION)

@@ -2,13 +2,13 @@
 
 Firmware 0.5.6, pass-through: torque = input_torque + vel_gain (clamp(input_vel +
 pos_gain (input_pos - pos)) - vel) + integrator, clamped to current_lim; input_vel and
-input_torque are each clamped to the same limits first. The firmware runs its loop at 8 kHz;
-here it is evaluated once a step.
+input_torque are each clamped to the same limits first. The firmware runs this loop at 8 kHz; the
+emulation evaluates it once per step.
 
-The torque omits the current loop's lag of 1 ms, because it changes no joint's motion: a step's
-torque acts at once. The measured current does follow the loop's bandwidth. A change of the motor's
-speed disturbs it through the EMF e, by e s / ((L s + R) (s + w)), until the loop has compensated.
-Beyond current_lim plus its margin of 8 A the firmware disarms. The estimates are those of
+The torque excludes the current loop's lag of 1 ms, which the plant adds (`drive.lag_s`). The
+measured current follows the loop's bandwidth. A change of the motor's speed disturbs it through the
+EMF e, by e s / ((L s + R) (s + w)), until the loop has compensated. Beyond current_lim plus its
+margin of 8 A the firmware disarms. The estimates come from
 `services.simulator.drives.axis_encoders`.
 
 Pure: no clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns,
@@ -40,7 +40,7 @@ Vector = NDArray[np.float64]
 
 FIRMWARE_RATE_HZ: Final = 8000.0
 INTEGRATOR_DECAY: Final = 0.99
-"""Factor per firmware cycle in which the torque is limited."""
+"""Factor on the integrator in each firmware cycle in which the torque is limited."""
 
 _SETTINGS: Final = (
     "controller.config.control_mode",
@@ -65,7 +65,7 @@ _SETTINGS: Final = (
 _ROWS: Final = 5
 """Rows of the current loops' state: see `_LawResults.loops`."""
 _POWER: Final = 4 * N_JOINTS
-"""Start of its last row."""
+"""Start of their last row."""
 
 
 class _LawResults(NamedTuple):
@@ -82,9 +82,9 @@ class _LawResults(NamedTuple):
     over_current: Vector
     """1 beyond the current limit plus its margin."""
     loops: Vector
-    """(60,), five rows: current, the EMF's rate behind the winding, the current that it drives, the
-    motor's true speed, and the filtered power of the torque that the controller requests, armed or
-    not; A, A/s, A, turn/s, W."""
+    """(60,), five rows: current, the EMF's rate behind the winding, the current that the EMF
+    drives, the motor's true speed, and the filtered power of the torque that the controller
+    requests, armed or not; A, A/s, A, turn/s, W."""
     broken: Vector
     """1 if the torque is NaN, or the current limit NaN or negative."""
     extremes: Vector
@@ -95,11 +95,11 @@ class AxisControl:
     """Inputs and torque of all axes; no state machine, no errors.
 
     Attributes:
-        armed: 1.0 in closed loop; also a factor of the torque.
+        armed: 1.0 in closed loop, else 0.0.
         connected: 1.0 from the first closed loop since start-up on; the controller then reads the
             encoder, in IDLE too.
-        derating: fraction of current_lim that remains in heat.
-        warmth: resistance of each winding over that at 25 C.
+        derating: fraction of current_lim that remains after derating for heat.
+        warmth: resistance of each winding divided by its resistance at 25 C.
     """
 
     def __init__(self, settings: Settings, encoders: AxisEncoders) -> None:
@@ -115,7 +115,7 @@ class AxisControl:
         self._dt_s = 0.0
         self._graph = graph = CompiledGraph(law_graph())
         columns = [settings.axis(name) for name in _SETTINGS]
-        # the true resistance heats the winding, whatever a calibration has found
+        # the true resistance heats the winding, not the calibrated one
         true_resistance = np.full(N_JOINTS, PHASE_RESISTANCE)
         columns[_SETTINGS.index("motor.config.phase_resistance")] = true_resistance
         live = (
@@ -136,7 +136,7 @@ class AxisControl:
         return bool(np.dot(self._regulates, self.armed) > 0.0)
 
     def hold_here(self, axis: int) -> None:
-        """Set the target to the motor's position, in position mode: `control_mode_updated`."""
+        """In position mode, move the target to the motor's position (`control_mode_updated`)."""
         if self._mode[axis] >= ControlMode.POSITION:
             self.input_pos[axis] = self._encoders.pos_estimate[axis]
 
@@ -169,12 +169,12 @@ class AxisControl:
         return beyond, least, most
 
     def integrate(self) -> None:
-        """Adopt the integrators and current loops of the last `control`."""
+        """Store the integrators and current loops of the last `control`."""
         self.integrator[:] = self.results.integrator
         self._loops[:] = self.results.loops
 
     def failing(self) -> list[tuple[int, str]]:
-        """Return the axes that the last `control` disarms, each with its fault's name.
+        """Return the axes to disarm after the last `control`, each with its fault's name.
 
         OVERSPEED is checked in IDLE too, the others only on armed axes.
         """
@@ -217,7 +217,7 @@ def law_graph() -> ca.Function:
     wanted = ca.if_else(position, of["pos_gain"] * (of["input_pos"] - of["pos"]), 0.0)
     wanted += _clamp(of["input_vel"], -clamp, clamp)
     v_err = ca.if_else(regulates, _clamp(wanted, -clamp, clamp) - vel, 0.0)
-    # the firmware empties the integrator in torque mode; it decays where the torque is limited
+    # the firmware resets the integrator in torque mode; it decays where the torque is limited
     integrator = ca.if_else(regulates, of["integrator"], 0.0)
     torque += v_err * of["vel_gain"] + integrator
     saturated = ca.fabs(torque) > limit
@@ -260,7 +260,7 @@ def _currents(
     """Return the current loops after the step, and the axes beyond the limit plus its margin.
 
     The EMF's rate x1 and the current x2 that it drives follow x1' = z - R / L x1, x2' = x1 - w x2
-    for a speed that ramps over the step, z = e' / L. A lowered limit is checked a cycle later.
+    with z = e' / L, for a speed that ramps over the step. A lowered limit acts a cycle later.
     """
     current, x1, x2, speed_before, _ = ca.vertsplit(loops, N_JOINTS)
     w, kt, resistance = (
@@ -271,7 +271,7 @@ def _currents(
     current = wanted + (current - wanted) * ca.exp(-w * dt_s)
     rate = ca.if_else(dt_s > 0.0, (speed - speed_before) / dt_s, 0.0)
     z = -2.0 / 3.0 * kt * 2.0 * math.pi * rate / PHASE_INDUCTANCE
-    # the winding's pole is kept apart from the loop's, because the formula divides by the gap
+    # the winding's pole must differ from the loop's, because the formula divides by the difference
     pole = resistance / PHASE_INDUCTANCE
     pole = ca.if_else(ca.fabs(pole - w) < 1e-3 * w, 1.001 * w, pole)
     pole = ca.fmax(pole, 1.0)

@@ -1,11 +1,11 @@
 """Encoders and velocity estimators of the emulated axes, as arrays (docs/drives.md).
 
-Firmware 0.5.6: a PLL estimates position and velocity from the encoder's whole counts. The firmware
-runs it at 8 kHz; here it is evaluated once a step, discretised exactly for the step's length. The
-firmware's estimate moves in quanta (one count in position, 0.0076 turn/s in velocity, which snaps
-to 0 below half of that). The emulation omits them, because they change no joint's motion. An axis
-that reads no words of its encoder, or wrong ones, runs cycle by cycle (`OddEncoder`). Pure: no
-clock, no I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns, turn/s.
+In firmware 0.5.6, a PLL estimates position and velocity from the encoder's whole counts, at 8 kHz.
+The emulation evaluates it once per step, discretised exactly for the step's length. The firmware's
+estimate moves in quanta (one count in position, 0.0076 turn/s in velocity, which snaps to 0 below
+half of that). The emulation omits them, because they change no joint's motion. An axis that reads
+no words from its encoder, or wrong words, runs cycle by cycle (`OddEncoder`). Pure: no clock, no
+I/O. Arrays are indexed by axis, shape (12,). Units at the motor: turns, turn/s.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from shared.joints import N_JOINTS
 Vector = NDArray[np.float64]
 
 _SPREAD: Final = 0.6180339887498949
-"""turn between the magnets of successive encoders, so that no two mounting angles are equal."""
+"""Angle between the magnets of successive encoders, turns; no two mounting angles are equal."""
 
 
 PERIOD_S: Final = 1.0 / 8000.0
-"""s of the firmware's control cycle."""
+"""Period of the firmware's control cycle, s."""
 ERROR_RATE_MAX: Final = 0.05
 """Filtered share of missing words beyond which an encoder has failed."""
 
@@ -47,14 +47,14 @@ def nearest(count: int, per_turn: int) -> int:
 
 
 class OddEncoder:
-    """Firmware's state of one absolute encoder from which it reads no words, or zeros.
+    """The firmware's state for an absolute encoder from which it reads no words, or zeros.
 
-    Firmware 0.5.6 moves the count by the wrapped difference between the last word and the new one.
+    Firmware 0.5.6 moves the count by the wrapped difference between the last word and the new word.
     Count and angle thus always agree within a turn, and neither shows a missing turn. A word of 0
     passes the parity check: the count moves to the encoder's nearest whole turn and stays there,
     without an error. A missing word leaves the count unchanged. The share of missing words passes a
-    filter of 1 s. From an empty filter the encoder fails after 51 ms without words; until then the
-    axis stays armed and blind. Units are counts of the encoder.
+    low-pass of 1 s. From zero, it exceeds the limit after 51 ms without words, and the encoder
+    fails; until then the axis stays armed. Units are counts of the encoder.
 
     Attributes:
         count: `shadow_count`.
@@ -72,7 +72,7 @@ class OddEncoder:
     def __init__(
         self, raw: int, count: int, pos: float, vel: float, *, per_turn: int, error_rate: float
     ) -> None:
-        """Continue from an encoder with true words so far."""
+        """Continue from an encoder that has sent true words."""
         self._per_turn = per_turn
         self.count, self.raw = count, raw
         self.angle = raw % per_turn
@@ -131,8 +131,8 @@ class AxisEncoders:
 
     Attributes:
         counts_from: each drive's count at the true zero, a whole number.
-        mount: each encoder's own count at the true zero, within a turn, by how its magnet is
-            mounted. It may be written before the first step.
+        mount: each encoder's own count at the true zero, within a turn; it depends on how its
+            magnet is mounted. It may be written before the first step.
         pos_estimate: turns.
         vel_estimate: turn/s.
         turns: the drives' whole counts, in turns.
@@ -158,7 +158,7 @@ class AxisEncoders:
         self.dt_s = 0.0
 
     def start(self, pos_turns: Vector, vel_turns: Vector) -> None:
-        """Adopt the true state, as after a long rest."""
+        """Start from the true state, as after a long time at rest."""
         self._derive()
         self._count(pos_turns)
         self._rows[0] = self._rows[2] = self._rows[3]
@@ -204,7 +204,7 @@ class AxisEncoders:
         self.set_count(axis, self.angle(axis))
 
     def read_words(self, axis: int, words: Words) -> None:
-        """Make an axis read nothing from its encoder, read zeros, or read true words again."""
+        """Set the words that an axis reads from its encoder."""
         if self._seen != self._settings.version:
             self._derive()
         odd = self.odd.get(axis)
@@ -222,13 +222,13 @@ class AxisEncoders:
         odd.words = words
 
     def clear_errors(self, axis: int) -> None:
-        """Empty the filter of an axis's missing words, as `clear_errors` does."""
+        """Reset the filter of an axis's missing words, as the firmware's `clear_errors` does."""
         self._error_rates.pop(axis, None)
         if axis in self.odd:
             self.odd[axis].error_rate = 0.0
 
     def estimate(self, dt_s: float, pos_turns: Vector) -> None:
-        """Run the encoders' PLLs over the step, exactly for counts that ramp within it."""
+        """Run the encoders' PLLs over the step; exact for counts that ramp within it."""
         if self._seen != self._settings.version:
             self._derive()
         if dt_s != self.dt_s:
@@ -259,7 +259,7 @@ class AxisEncoders:
         ]
 
     def commutate(self, torque: Vector) -> None:
-        """Scale the odd axes' torques, because their rotors have moved from the last word."""
+        """Scale the odd axes' torques, because their rotors have moved since the last word."""
         poles = self._settings.axis("motor.config.pole_pairs")
         for axis, odd in self.odd.items():
             torque[axis] *= math.cos(2.0 * math.pi * poles[axis] * odd.off_phase)
@@ -270,7 +270,7 @@ class AxisEncoders:
             raw, cpr = self._raw(axis), self._cpr[axis]
             odd.run(dt_s, raw, float(self._bandwidth[axis]))
             self._rows[3, axis] = odd.count / cpr
-            if odd.fails:  # no estimate is made, and the last one stays
+            if odd.fails:  # the last estimate stays
                 self._next[:, axis] = self._rows[:2, axis]
                 continue
             self._next[:, axis] = odd.pos / cpr, odd.vel / cpr
@@ -280,11 +280,11 @@ class AxisEncoders:
                 del self.odd[axis]
 
     def _raw(self, axis: int) -> int:
-        """Return an encoder's own count, with turns; for an odd one only after `_count`."""
+        """Return an encoder's own count, with turns; for an odd encoder only after `_count`."""
         return self.counted(axis) - round(float(self.counts_from[axis] - self.mount[axis]))
 
     def _count(self, pos_turns: Vector) -> None:
-        """Write the encoder's whole counts, in turns as the setting `cpr` has them."""
+        """Write the encoders' whole counts, in turns of the setting `cpr`."""
         counts = self._rows[3]
         np.multiply(pos_turns, self._counts_per_turn, out=counts)
         np.floor(counts, out=counts)

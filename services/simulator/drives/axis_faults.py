@@ -1,11 +1,11 @@
-"""Faults of the emulated drives: error registers by name, and conditions that last.
+"""Faults of the emulated drives: error registers by name, and lasting conditions.
 
 The registers are those of firmware 0.5.6. A failure of motor, encoder or controller also sets
-`axis.error` (up to 0.5.4 that stayed 0). A failed controller gives no torque, so the motor misses
-its command in the same cycle.
+`axis.error` (up to 0.5.4 it stayed 0). A failed controller gives no torque, so the motor reports a
+missing command in the same cycle.
 
-A condition (power, cable, heat, encoder) acts at every step until it ends: errors that are cleared
-while the drive is hot return at once.
+A condition (power, cable, heat, encoder) acts at every step until it ends. For example, an error
+that is cleared while the drive is hot returns at once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AXIS_NAMES: Final = tuple(f"{module}.axis{index}" for module in MODULES for inde
 
 
 class AxisErrors(NamedTuple):
-    """Error registers of an axis, and that of its ODrive."""
+    """Error registers of an axis and its ODrive."""
 
     axis: int = 0
     motor: int = 0
@@ -41,7 +41,7 @@ class AxisErrors(NamedTuple):
     """`odrv.error`; the same on both axes, because its errors disarm both."""
 
     def with_(self, other: AxisErrors) -> AxisErrors:
-        """Return the union of both."""
+        """Return these errors together with the others."""
         return AxisErrors(*(a | b for a, b in zip(self, other, strict=True)))
 
 
@@ -66,7 +66,7 @@ def controller_fault(error: ControllerError) -> AxisErrors:
 
 
 def in_idle(fault: AxisErrors, *, connected: bool) -> AxisErrors:
-    """Return a fault's errors on an axis in IDLE, whose motor misses no command.
+    """Return a fault's errors on an axis in IDLE, whose motor expects no command.
 
     Before its first closed loop a controller is not connected, so it detects no invalid estimate.
     """
@@ -96,9 +96,8 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
     "WATCHDOG": AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED),
     "ESTOP": AxisErrors(AxisError.ESTOP_REQUESTED),
 }
-"""Faults of an axis by name, for `AxisBank.inject`; its sibling keeps its torque unless shared.
-
-DISARM is silent: IDLE without an error.
+"""Faults of an axis by name, for `AxisBank.inject`; except for `SHARED_FAULTS` the sibling keeps
+its torque. DISARM leads to IDLE without an error.
 """
 
 SHARED_FAULTS: Final = frozenset({"DRV_FAULT"})
@@ -118,9 +117,9 @@ BUS_FAULTS: Final[Mapping[str, AxisErrors]] = {
 """Faults of the DC bus by name: they disarm both axes of an ODrive."""
 
 TALKS_S: Final = 0.02
-"""s from power to the first frame."""
+"""Time from power-up to the first frame, s."""
 BOOT_S: Final = 1.54
-"""s from power to the start of the axes; the firmware measures the currents' zeros meanwhile."""
+"""Time from power-up to the start of the axes, s; the firmware first measures current offsets."""
 
 
 class Conditions:
@@ -128,8 +127,8 @@ class Conditions:
 
     Attributes:
         down: the drives (0 .. 5) that are without power, or do not communicate yet.
-        starting: the drives whose axes do not run yet, and take no state.
-        silent: the axes (0 .. 11) without communication: down, or with the cable out.
+        starting: the drives whose axes do not run yet and execute no request.
+        silent: the axes (0 .. 11) without communication: down, or unplugged.
         deaf: the axes (0 .. 11) that receive and acknowledge nothing, but still send.
         choked: the axes (0 .. 11) whose bus accepts no frames, because its send queue is full.
         heat: motors, output stages and their thermistors.
@@ -152,7 +151,7 @@ class Conditions:
         return not (self.starting or self._encoders.odd or self.heat.hot)
 
     def link(self, drive: int, *, up: bool) -> None:
-        """Pull a drive's cable, or plug it in."""
+        """Unplug a drive's cable, or plug it in."""
         self._linked[drive] = up
         self._update_silent()
 
@@ -167,14 +166,14 @@ class Conditions:
         (self.choked.update if full else self.choked.difference_update)(axes)
 
     def boot(self, drive: int, now_s: float) -> None:
-        """Start to boot a drive."""
+        """Start booting a drive."""
         self.down.add(drive)
         self.starting.add(drive)
         self._on_s[drive] = now_s
         self._update_silent()
 
     def power_off(self, drive: int) -> None:
-        """Keep a drive down until `boot`."""
+        """Switch a drive off until `boot`."""
         self.boot(drive, math.inf)
 
     def is_off(self, drive: int) -> bool:
@@ -182,7 +181,7 @@ class Conditions:
         return self._on_s[drive] == math.inf
 
     def finish_boots(self, now_s: float) -> list[int]:
-        """Return the drives whose axes run from now on; let drives communicate when due."""
+        """Start the communication and axes of drives when due; return drives whose axes start."""
         up = [drive for drive in self.down if self._on_s[drive] + TALKS_S <= now_s]
         if up:
             self.down.difference_update(up)
@@ -192,7 +191,7 @@ class Conditions:
         return begin
 
     def read_encoder(self, axis: int, words: Words) -> None:
-        """Make an axis read no words of its encoder, zeros, or true words again."""
+        """Set the words that an axis reads from its encoder."""
         self._encoders.read_words(axis, words)
 
     def disarming(self) -> list[tuple[int, AxisErrors]]:

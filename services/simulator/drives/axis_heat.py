@@ -7,8 +7,8 @@ Each motor has two thermal nodes, each output stage one; Iq is the motor's curre
     t_s T_s' = T_a + k_s Iq^2 - T_s
 
 A thermistor's reading passes two low-passes of 0.1 s, as in firmware 0.5.6. Between its two
-temperature limits the current limit falls linearly to zero; `OVER_TEMP_MARGIN` above the upper one
-the axis disarms. A stage that heats up suddenly thus derates first and disarms 0.5 s later.
+temperature limits the current limit falls linearly to zero; `OVER_TEMP_MARGIN` above the upper
+limit the axis disarms. A stage that heats up suddenly thus derates first and disarms 0.5 s later.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from shared.toml_file import Range, Section
 Vector = NDArray[np.float64]
 
 OVER_TEMP_MARGIN: Final = 5.0
-"""C beyond `temp_limit_upper` at which the firmware disarms."""
+"""Excess over `temp_limit_upper` at which the firmware disarms, C."""
 FILTER_S: Final = 0.1
-"""Time constant of each of a thermistor's two low-passes."""
+"""Time constant of each of a thermistor's two low-passes, s."""
 SETTLED: Final = 0.05
-"""C; a reading within this of the truth counts as settled."""
+"""Maximum error of a settled reading, C."""
 EVERY_S: Final = 0.1
-"""Step of the slow temperatures."""
+"""Time step of the temperatures, s."""
 COPPER: Final = 0.00393
-"""1/K, resistance of copper at 25 C."""
+"""Temperature coefficient of copper's resistance at 25 C, 1/K."""
 REFERENCE: Final = 25.0
-"""C at which the resistance is given."""
+"""Temperature at which the resistance is given, C."""
 _FET: Final = "motor.fet_thermistor.config."
 _MOTOR: Final = "motor.motor_thermistor.config."
 
@@ -46,32 +46,32 @@ Kelvins = Annotated[float, Range(-50.0, 200.0, "K")]
 class Heat(Section, frozen=True):
     """Thermal model of motors and output stages, the same for all motors and axes.
 
-    The motors' values are assumed: measure the motors.
+    The motors' values are assumed; measure your motors.
     """
 
     ambient: Annotated[float, Range(-40.0, 60.0, "C")] = 25.0
     warm: Kelvins = 0.0
-    """Initial temperature of motors and output stages above the air."""
+    """Initial temperature of motors and output stages, relative to the air."""
     resistance: Annotated[float, Range(0.001, 10.0, "ohm")] = PHASE_RESISTANCE
     """Resistance of a phase at 25 C. Assumed: an outrunner of some 80 mm with 100 rpm/V."""
     winding_capacity: Annotated[float, Range(1.0, 1e4, "J/K")] = 100.0
-    """0.2 kg of copper (385 J/(kg K)) and its share of the teeth. Assumed."""
+    """0.2 kg of copper (385 J/(kg K)) and a share of the stator's teeth. Assumed."""
     winding_to_housing: Annotated[float, Range(0.01, 20.0, "K/W")] = 0.5
-    """With the winding's capacity, a time constant of 50 s, usual for this size. Assumed."""
+    """Gives a time constant of 50 s with `winding_capacity`, usual for this size. Assumed."""
     housing_capacity: Annotated[float, Range(1.0, 1e5, "J/K")] = 1500.0
-    """Half of a module's 8.73 kg belongs to each motor; 3 kg of steel and aluminium take part.
-    Assumed."""
+    """Half of a module's 8.73 kg belongs to each motor; 3 kg of steel and aluminium heat up with
+    it. Assumed."""
     housing_to_air: Annotated[float, Range(0.01, 50.0, "K/W")] = 1.2
     """0.08 m^2 of housing and links at 10 W/(m^2 K), free convection and radiation. Assumed."""
     stage_per_square_ampere: Annotated[float, Range(0.0, 1.0, "K/A^2")] = 0.054
-    """Rise of an output stage as its thermistor reads it. On a v3.5 with 48 V, a user measured at
-    most 40 A continuously, with the heat sink in still air at 13 C (ODrive's forum, thread 972).
-    The thermistor is assumed to read 100 C there."""
+    """Temperature rise that an output stage's thermistor reads. On a v3.5 with 48 V, a user
+    measured at most 40 A continuously, with the heat sink in still air at 13 C (ODrive's forum,
+    thread 972). The thermistor is assumed to read 100 C at that current."""
     stage_s: Annotated[float, Range(1.0, 1e4, "s")] = 200.0
     """Time constant of the heat sink. Assumed."""
     motor_thermistor: bool = False
-    """True if each winding has a thermistor, wired to its drive; the drive's setting
-    `motor.motor_thermistor.config.enabled` makes it count."""
+    """True if each winding has a thermistor, wired to its drive. The drive uses it if its setting
+    `motor.motor_thermistor.config.enabled` is True."""
 
 
 class AxisHeat:
@@ -106,7 +106,7 @@ class AxisHeat:
         self._warm_up()
 
     def advance(self, dt_s: float) -> None:
-        """Advance by dt, s, under the torques of the step before."""
+        """Advance by `dt_s` under the torques of the previous step."""
         torque = self._torque
         self._square += dt_s * torque * torque
         self._passed_s += dt_s
@@ -119,7 +119,7 @@ class AxisHeat:
             self._filter(dt_s)
 
     def skip(self, square: Vector, seconds: float) -> None:
-        """Advance the temperatures alone, under a mean squared torque (12,), (N m)^2."""
+        """Advance only the temperatures, under a mean squared torque (12,), (N m)^2."""
         while seconds > 0.0:
             step_s = min(1.0, seconds)
             self._slow_step(square, step_s)
@@ -136,7 +136,7 @@ class AxisHeat:
 
     @property
     def derating(self) -> float:
-        """Smallest fraction of an axis's current limit that remains in heat."""
+        """Smallest fraction of an axis's current limit that remains after derating."""
         return float(self._control.derating.min())
 
     def numbers(self) -> tuple[float, ...]:
@@ -144,7 +144,7 @@ class AxisHeat:
         return tuple(np.concatenate((self.winding, self.housing, self.stage)).tolist())
 
     def set_numbers(self, numbers: tuple[float, ...]) -> None:
-        """Restore temperatures from `numbers`; if empty, keep the plant's."""
+        """Restore the temperatures of `numbers`; if it is empty, change nothing."""
         if numbers:
             self.winding[:], self.housing[:], self.stage[:] = np.array(numbers).reshape(3, -1)
             self._read()
@@ -176,7 +176,7 @@ class AxisHeat:
         return raw
 
     def _read(self) -> None:
-        """Read the thermistors between jumps, when the filters' lag is negligible."""
+        """Read the thermistors; the filters' lag is negligible unless a temperature has jumped."""
         if self._heat.motor_thermistor:
             self.motor[:] = self.winding
         if not self._filtering:
@@ -184,7 +184,6 @@ class AxisHeat:
         self._derate()
 
     def _filter(self, dt_s: float) -> None:
-        """Pass the readings of the output stages through their two low-passes."""
         raw, share = self._raw(), 1.0 - np.exp(-dt_s / FILTER_S)
         self._half += share * (raw - self._half)
         self.fet += share * (self._half - self.fet)

@@ -1,14 +1,14 @@
 """Settings of the emulated drives by the firmware's names: a plain table {name: value}.
 
 The defaults are those of firmware 0.5.6; this robot's values are in `shared.can.drive_settings`.
-Each name has one column for all drives: the emulation reads its limits from the columns, a front
-reads and writes single values by name.
+Each name has one column for all drives: the emulation reads its limits from the columns, and a
+front reads and writes single values by name.
 
 Source: the configuration structs of firmware 0.5.6 (odriverobotics/ODrive). The over-voltage
 level is that of the 56 V board.
 
 `encoder.config.direction` and `phase_offset` have no effect on the motion, as on a calibrated
-drive; currents are reported with the sign of the first.
+drive; currents are reported with the sign of `direction`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ AXIS_SETTINGS: Final[Mapping[str, Value]] = {
     "encoder.config.calib_scan_omega": 4.0 * math.pi,
     "encoder.config.pre_calibrated": False,
 }
-"""Settings of each axis, below `axis0.` and `axis1.`, with defaults of the settings' types."""
+"""Settings of each axis, below `axis0.` and `axis1.`; the defaults have the settings' types."""
 
 DRIVE_SETTINGS: Final[Mapping[str, Value]] = {
     "config.dc_bus_undervoltage_trip_level": 8.0,
@@ -105,17 +105,17 @@ NAMES: Final = (
 """Every setting of one ODrive."""
 
 PHASE_RESISTANCE: Final = 0.1
-"""ohm; assumed for a motor with this torque constant. Found by calibration, never set by hand."""
+"""Phase resistance, ohm; assumed for a motor with this torque constant. Calibration measures it."""
 PHASE_INDUCTANCE: Final = 5e-5
-"""H; assumed for the same motor. Found by calibration, never set by hand."""
+"""Phase inductance, H; assumed for the same motor. Calibration measures it."""
 POLE_PAIRS: Final = 7
-"""True pole pairs of the motors, whatever a drive's setting says; assumed."""
+"""True pole pairs of the motors, which a drive's setting does not change; assumed."""
 ENCODER_MODE: Final = 257
-"""Absolute over SPI, AMS; set by hand before anything is calibrated."""
+"""Absolute over SPI, AMS; set by hand before any calibration."""
 CALIBRATION_CURRENT: Final = 15.0
-"""A; set by hand too, because the default of 10 A does not turn a knee that hangs on its stop."""
+"""A; also set by hand, because the default of 10 A does not turn a knee that hangs on its stop."""
 DIRECTION: Final = 1
-"""+1 or -1, by the wiring of a motor's phases. Found by calibration, never set by hand."""
+"""+1 or -1, from the wiring of a motor's phases. Calibration detects it."""
 
 
 class Settings:
@@ -163,7 +163,7 @@ class Settings:
         number = float(value)
         whole = isinstance(default, int)
         if math.isnan(number) or (whole and not number.is_integer()):
-            raise DriveError(f"{name} = {value!r}: it must be of type {type(default).__name__}")
+            raise DriveError(f"{name} = {value!r}: not a valid {type(default).__name__}")
         column[row] = bool(value) if isinstance(default, bool) else number
         self.version += 1
 
@@ -186,7 +186,7 @@ class Settings:
         return {name: self.get(drive, name) for name in NAMES}
 
     def save(self, drive: int) -> None:
-        """Keep a drive's settings over a restart, as `save_configuration` does."""
+        """Save a drive's settings for a restart, as `save_configuration` does."""
         self._saved[drive] = self.table(drive)
 
     def restore(self, drive: int) -> None:
@@ -213,7 +213,7 @@ def configured(
 ) -> Settings:
     """Return the settings that the services rely on, saved on every drive.
 
-    Without `watchdog` the drives' watchdogs do not run, whatever their timeout.
+    Without `watchdog` the drives' watchdogs do not run.
     """
     settings = Settings()
     need = Need(drive, encoder_counts_per_turn, watchdog)

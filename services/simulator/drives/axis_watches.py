@@ -9,16 +9,16 @@ from services.simulator.drives.axis_settings import Settings
 from shared.joints import N_JOINTS
 
 BANDWIDTH: Final = 20.0
-"""rad/s of both filters."""
+"""Bandwidth of both power filters, rad/s."""
 _BELOW: Final = "controller.config.spinout_"
 
 
 class Watchdogs:
-    """Watchdogs of all axes; each counts down the timeout of its last feed.
+    """Watchdogs of all axes; each counts down from the timeout at its last feed.
 
-    Firmware 0.5.6: feeding loads a counter with the present timeout, and only an enabled watchdog
-    counts it down. A watchdog that is enabled before it was fed has a counter of 0 and expires at
-    once; setting its timeout meanwhile does not feed it.
+    In firmware 0.5.6, feeding loads a counter with the present timeout, and only an enabled
+    watchdog counts it down. A watchdog that is enabled before it is fed has a counter of 0 and
+    expires at once. Setting its timeout does not feed it.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -60,16 +60,16 @@ class Watchdogs:
 
 
 class Spinout:
-    """SPINOUT_DETECTED of the axes that were disarmed under load.
+    """Check for SPINOUT_DETECTED on axes that were disarmed under load.
 
-    Firmware 0.5.6: after disarming, the filter of electrical power minus copper losses continues
+    In firmware 0.5.6, after disarming, the filter of electrical power minus copper losses continues
     with its last input. The filter of mechanical power follows the torque that the controller would
-    give. An axis that was lifting and now sinks seems to brake with power: a spinout, in IDLE. For
-    armed emulated motors both powers exclude the copper loss and are equal, so no armed axis spins
-    out.
+    give. An axis that was lifting and now sinks seems to draw power while it brakes, so the
+    firmware reports a spinout in IDLE. For armed emulated motors both powers exclude the copper
+    loss and are equal, so no armed axis spins out.
 
     Attributes:
-        watched: filtered electrical power of each axis, and its last input, W.
+        watched: filtered electrical power of each watched axis, and its last input, W.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -79,7 +79,7 @@ class Spinout:
         self.watched: dict[int, tuple[float, float]] = {}
 
     def disarmed(self, axis: int, filtered: float, last: float) -> None:
-        """Watch an axis that is disarmed at these powers, W, if they are high enough."""
+        """Watch a disarmed axis if its filtered or last electrical power, W, is high enough."""
         if max(filtered, last) > self._electrical[axis]:
             self.watched[axis] = filtered, last
 

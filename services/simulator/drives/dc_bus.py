@@ -1,4 +1,4 @@
-"""The DC bus of each emulated ODrive: current of its motors and of regeneration.
+"""The DC bus of each emulated ODrive: its voltage, and the current of motors and regeneration.
 
 The supply is a constant voltage behind a resistance and accepts current both ways, like a battery.
 The current covers mechanical power and copper losses: I_bus = sum(torque 2 pi vel + 1.5 R Iq^2) /
@@ -19,9 +19,9 @@ Vector = NDArray[np.float64]
 
 SUPPLY_VOLTAGE: Final = 48.0
 SUPPLY_RESISTANCE: Final = 0.05
-"""ohm, of battery and cable; assumed."""
+"""Resistance of battery and cable, ohm; assumed."""
 DEAD_VOLTAGE: Final = 6.0
-"""V; below it the processor stops too."""
+"""Voltage below which the processor stops, V."""
 BRAKE_DUTY_MAX: Final = 0.95
 
 
@@ -46,7 +46,7 @@ class DcBus:
         self._seen = -1
 
     def check(self, least: float, most: float) -> dict[int, str]:
-        """Return the drives (0 .. 5) that their limits disarm, each with a name in `BUS_FAULTS`.
+        """Return the drives (0 .. 5) beyond a limit, each with the fault's name in `BUS_FAULTS`.
 
         `least` and `most` are the present minimum and maximum power of a motor, W.
         """
@@ -65,7 +65,7 @@ class DcBus:
         return float(self._power[axis]), float(self._mechanical[axis])
 
     def _derive(self) -> None:
-        """Compute the constants, and the power below which no limit can be near."""
+        """Compute the constants, and the range of powers in which no limit can be near."""
         settings = self._settings
         self._seen = settings.version
         self._lowest = settings.drive("config.dc_bus_undervoltage_trip_level").copy()
@@ -89,7 +89,7 @@ class DcBus:
         if self._seen != self._settings.version:
             self._derive()
         power = self._power[0::2] + self._power[1::2]
-        # V = supply - R I and V I = P: the higher root; beyond the supply's peak, half of it
+        # V = supply - R I and V I = P: the higher root; beyond the peak power, half the supply
         root = np.maximum(self.supply**2 - 4.0 * self.resistance * power, 0.0)
         voltage = 0.5 * (self.supply + np.sqrt(root))
         current = np.divide(power, voltage, out=np.zeros(N_DRIVES), where=voltage > 1.0)

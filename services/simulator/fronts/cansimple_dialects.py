@@ -1,8 +1,9 @@
 """The two dialects of CANSimple that the emulated drives use.
 
-Firmware 0.5 and 0.6 share setpoints, limits and gains; `DIALECTS` holds the differences. A trap of
-0.5.6: its encoder frames contain 0, 0 from start-up until the first closed loop. Endpoint ids of
-0.6 come with each firmware's `flat_endpoints.json`; the emulation's are `SDO_ENDPOINTS`.
+Firmware 0.5 and 0.6 share the frames of setpoints, limits and gains; `DIALECTS` contains the
+differences. A trap of 0.5.6 is emulated: encoder frames contain 0, 0 from start-up until the first
+closed loop. Each 0.6 firmware defines its endpoint ids in `flat_endpoints.json`; the emulation uses
+`SDO_ENDPOINTS`.
 """
 
 from __future__ import annotations
@@ -107,9 +108,9 @@ class Dialect(NamedTuple):
     answers: Mapping[int, Answer]
     """Answers to requests for data, by command."""
     asked: Mapping[int, Callable[[AxisBank, int, bytes], bytes | None]]
-    """Answers to frames of any length, from their eight bytes, by command; None for no answer."""
+    """Answers to frames of any length, padded to eight bytes, by command; None for no answer."""
     sdo: Callable[[AxisBank, int, bytes], bytes | None] | None
-    """Maps the payload of 0x004 to that of 0x005; None for no answer."""
+    """Returns the payload of 0x005 for that of 0x004, or None for no answer; None without SDO."""
     setters: Mapping[int, Setter]
     """Setters by command, which replace the front's own."""
 
@@ -214,7 +215,6 @@ def _full(name: str, axis: int) -> str:
 
 
 def _sdo_layout(value: Value) -> str:
-    """Return the `struct` layout of an endpoint with this type of value."""
     if isinstance(value, bool):
         return "<?"
     return "<I" if isinstance(value, int) else "<f"

@@ -23,7 +23,7 @@ from shared.joints import N_JOINTS
 _DATA_BYTES = 8
 _SDO_BYTES = 4
 _MAILBOXES = 3
-_EARLY_S = 1e-6  # tolerance of a period's end for rounding
+_EARLY_S = 1e-6  # tolerance for rounding at a period's end
 _S_PER_MS = 1e-3
 _FLOAT = struct.Struct("<f").unpack_from
 _FLAGGED_ID = REMOTE_FLAG | cansimple.NODE_MASK << cansimple.COMMAND_BITS | cansimple.COMMAND_MASK
@@ -33,9 +33,9 @@ class CanSimpleFront:
     """CAN front of the bank: applies received frames, sends estimates and heartbeats.
 
     `nodes[i]` maps the CAN node ids on `hubs[i]` to axes of the bank. A drive that does not
-    communicate (no power, starting up, cable out) neither receives, sends nor acknowledges. On a
-    bus without another node, frames wait until it returns. An axis's settings give its
-    rates: `config.can.encoder_rate_ms`, `config.can.heartbeat_rate_ms`.
+    communicate (no power, starting up, unplugged) neither receives nor sends nor acknowledges
+    frames. On a bus without another node, frames wait until the drive returns. The settings
+    `config.can.encoder_rate_ms` and `config.can.heartbeat_rate_ms` set an axis's rates.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class CanSimpleFront:
             bank.settings.save(drive)
 
     def receive(self) -> None:
-        """Apply all frames that have arrived; in each mailbox the newest wins."""
+        """Apply all received frames in order."""
         bank = self._bank
         silent, choked = bank.conditions.silent | bank.conditions.deaf, bank.conditions.choked
         for bus in self._buses:
@@ -89,7 +89,7 @@ class CanSimpleFront:
                 elif mailbox[0] not in silent:
                     axis, setter = mailbox
                     bank.feed(axis)
-                    # The firmware reads its eight-byte buffer whatever the frame's length.
+                    # The firmware reads all eight bytes of its buffer, even for a shorter frame.
                     setter(bank, axis, data.ljust(_DATA_BYTES, b"\0"))
 
     def send_encoders(self) -> None:
@@ -135,7 +135,7 @@ class CanSimpleFront:
         self._heartbeat_from_s = min(due, default=math.inf)
 
     def _count(self, axis: int, now_s: float) -> None:
-        """Count the mailboxes of a heartbeat and of an encoder frame that left with it."""
+        """Count the mailboxes that a heartbeat, and an encoder frame sent with it, occupy."""
         sent_s, frames = self._sent[axis >> 1]
         since_s = now_s - (self._next_encoder_s[axis] - self._encoder_periods_s[axis])
         frames = 1 + (abs(since_s) < _EARLY_S) + (frames if sent_s == now_s else 0)
@@ -185,8 +185,8 @@ class CanSimpleFront:
     def _is_lost(self, axis: int) -> bool:
         """Return True if an answer is lost because all three mailboxes of its drive are full.
 
-        They are full for about 0.6 ms while heartbeats and encoder frames of both axes leave. At
-        1 kHz, 0.6 % of the requests get no answer, and no answer is repeated.
+        They are full for about 0.6 ms while heartbeats and encoder frames of both axes are sent. At
+        1 kHz, 0.6 % of the requests get no answer, and the drive repeats none.
         """
         sent_s, frames = self._sent[axis >> 1]
         if frames < _MAILBOXES or sent_s != self._bank.now_s:
@@ -201,7 +201,7 @@ def _periods_s(periods_ms: NDArray[np.float64]) -> list[float]:
 
 
 class _Bus:
-    """A hub with its axes, and values computed once."""
+    """A hub with its axes, and precomputed values."""
 
     def __init__(
         self, hub: UnixCanHub, nodes: Mapping[int, int], setters: Mapping[int, Setter]
@@ -233,7 +233,7 @@ def _writer(columns: Sequence[str], unpack: Callable[[bytes], Sequence[float]]) 
 
 
 def _set_input_pos(bank: AxisBank, axis: int, data: bytes) -> None:
-    """Write a target; this frame is too frequent for the slower `_writer`."""
+    """Write a target; `_writer` is too slow for this frequent frame."""
     pos, vel, torque = cansimple.unpack_input_pos(data)
     bank.input_pos[axis] = pos
     bank.input_vel[axis] = vel

@@ -1,9 +1,9 @@
-"""The native (Fibre, legacy packet format) side of the emulated drives (docs/drives.md).
+"""Native protocol (Fibre, legacy packet format) of the emulated drives (docs/drives.md).
 
 `endpoints` is the part of firmware 0.5.6's tree that this project uses: all settings of the bank by
 the firmware's names, measurements, and functions. Units at the motor: turns, turn/s, N m, A, V, C.
 
-`FibreFront` is the protocol of one board, bytes in and bytes out; little-endian throughout.
+`FibreFront` is the protocol of one board: it turns requests into answers, all little-endian.
 
 Request: sequence number, endpoint id (bit 15 requests an answer), size of the answer,
 payload, and a trailer that identifies the client's table of endpoints. Answer: the
@@ -26,7 +26,7 @@ from shared.exceptions import DriveError
 
 PROTOCOL_VERSION: Final = 1
 ANSWER_BYTES: Final = 61
-"""Bytes after the sequence number in a packet of 64 bytes; a longer reply is cut."""
+"""Maximum bytes after an answer's sequence number; a longer answer is truncated."""
 
 _CRC16_POLYNOMIAL = 0x3D65
 _ANSWER = 0x8000
@@ -59,7 +59,7 @@ _UNSIGNED = {
     "controller.config.input_mode": "uint8",
     "encoder.config.mode": "uint16",
 }
-"""Whole settings that are not an int32."""
+"""Integer settings whose type is not int32."""
 _INPUT_MODE = "controller.config.input_mode"
 _MODES = ("controller.config.control_mode", _INPUT_MODE)
 
@@ -78,11 +78,11 @@ class EmulatedBoard(NamedTuple):
 
     @property
     def is_responding(self) -> bool:
-        """True if the board is powered, up and plugged in."""
+        """True if the board is powered, started and plugged in."""
         return self.bank.is_responding(self.axis(0))
 
     def save(self) -> None:
-        """Save the configuration, which restarts the board; refused while an axis is armed."""
+        """Save the configuration, which restarts the board; ignored while an axis is armed."""
         if all(self.bank.state[self.axis(i)] == AxisState.IDLE for i in AXES):
             self.bank.settings.save(self.drive)
             self.bank.reboot(self.axis(0))
@@ -98,7 +98,7 @@ class Property(NamedTuple):
 
 
 class _Argument(NamedTuple):
-    """An argument of a function: an endpoint of its own, written before the call."""
+    """An argument of a function: a separate endpoint, written before the call."""
 
     name: str
     type: str
@@ -109,7 +109,7 @@ class Function(NamedTuple):
 
     name: str
     call: Callable[..., None]
-    """Function of the board and the arguments."""
+    """Called with the board and the arguments."""
     arguments: tuple[_Argument, ...] = ()
 
 
@@ -140,8 +140,6 @@ def endpoints() -> list[Endpoint]:
 
 
 def _axis(i: int) -> list[Property | Function]:
-    """Return the endpoints of one axis, without its settings."""
-
     def shown(name: str, kind: str, value: Callable[[AxisBank, int], Value]) -> Property:
         return Property(name, kind, lambda b: value(b.bank, b.axis(i)))
 
@@ -247,7 +245,7 @@ def _set(board: EmulatedBoard, name: str, value: Value) -> None:
 
 
 def crc16(initial: int, data: bytes) -> int:
-    """Return Fibre's CRC16: polynomial 0x3d65, nothing reflected, no final xor."""
+    """Return Fibre's CRC16: polynomial 0x3d65, no reflection, no final xor."""
     crc = initial
     for byte in data:
         crc ^= byte << 8
@@ -261,8 +259,8 @@ class FibreFront:
 
     Attributes:
         descriptor: the JSON with endpoints and ids, for clients.
-        ignored: number of invalid requests, which the firmware ignores too, and of values that no
-            setting accepts.
+        ignored: number of invalid requests, which the firmware ignores too, and of values that a
+            setting refused.
     """
 
     def __init__(self, board: EmulatedBoard) -> None:
@@ -277,7 +275,7 @@ class FibreFront:
         self._version_id = self._crc << 16 | crc16(self._crc, self.descriptor)
 
     def answer(self, packet: bytes) -> bytes | None:
-        """Carry out one request; return the answer, or None."""
+        """Execute one request; return the answer, or None if there is none."""
         if len(packet) < _HEADER.size + _U16.size:
             self.ignored += 1
             return None
@@ -288,14 +286,14 @@ class FibreFront:
         if sequence & _ANSWER or trailer != (self._crc if number else PROTOCOL_VERSION):
             self.ignored += 1
             return None
-        known = number <= len(self._rows)  # the firmware's answer for any other is empty
+        known = number <= len(self._rows)  # the firmware's answer for others is empty
         result = self._operate(number, payload)[: min(size, ANSWER_BYTES)] if known else b""
         if not endpoint & _ANSWER:
             return None
         return _U16.pack(sequence | _ANSWER) + result
 
     def _operate(self, number: int, payload: bytes) -> bytes:
-        """Return the endpoint's value; then write to it, or call it."""
+        """Write to an endpoint or call it; return its value before that."""
         if number == 0:
             return self._describe(payload)
         row = self._rows[number - 1]
@@ -319,7 +317,6 @@ class FibreFront:
         return held
 
     def _describe(self, payload: bytes) -> bytes:
-        """Return a part of the descriptor, or its id."""
         if len(payload) < _U32.size:
             return b""
         (offset,) = _U32.unpack_from(payload)

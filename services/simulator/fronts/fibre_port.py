@@ -1,8 +1,7 @@
-"""The USB plugs of the emulated drives: UNIX sockets, one packet per bulk transfer.
+"""The USB ports of the emulated drives: UNIX sockets, one packet per bulk transfer.
 
-A plug is a listening socket whose file name is the drive's serial number; the stand-in for libusb
-(`libusb_standin.c`) is the other end. `FibreHub` is all plugs of one simulator; it polls them
-together.
+A port is a listening socket whose file name is the drive's serial number. The stand-in for libusb
+(`libusb_standin.c`) connects to it. `FibreHub` polls all ports of one simulator.
 """
 
 from __future__ import annotations
@@ -17,43 +16,43 @@ from services.simulator.fronts.fibre_front import FibreFront
 from services.simulator.fronts.unix_can_hub import accept, listen
 
 PACKET_BYTES: Final = 64
-"""A full-speed bulk transfer."""
+"""Maximum bytes of a full-speed bulk packet."""
 CHECK_EVERY: Final = 8
-"""Polls between two checks of the plugs for new clients and silent boards."""
+"""Polls between two checks of the ports for new clients and silent boards."""
 
-_PACKETS = 64  # a client that floods the link must not hold up the simulator
+_PACKETS = 64  # a client that floods the link must not delay the simulator
 
 
 class FibrePort:
-    """The USB plug of one board.
+    """The USB port of one board.
 
-    While the board does not respond (`AxisBank.is_responding`: no power, booting, cable pulled)
-    the plug is out. Every client then loses the drive, and finds it again when it returns.
+    While the board does not respond (`AxisBank.is_responding`: no power, booting, unplugged) the
+    port is closed. Every client then loses the drive, and finds it again when it returns.
 
     Raises:
-        FleetError: the path cannot be listened on.
+        FleetError: listening on the path fails.
     """
 
     def __init__(self, front: FibreFront, path: Path) -> None:
         self.path = path
         self.front = front
         self.clients: dict[int, socket.socket] = {}
-        """Processes that see this drive, by descriptor."""
+        """Connections of clients, by descriptor."""
         self.listener: socket.socket | None = None
-        """None while the plug is out."""
+        """None while the port is closed."""
         self.plug()
 
     @property
     def right(self) -> bool:
-        """True if the plug matches the board: in while the board responds, else out."""
+        """True if the port matches the board: open while the board responds, else closed."""
         return self.front.board.is_responding == (self.listener is not None)
 
     def plug(self) -> None:
-        """Put the plug in; clients find the drive when they next look."""
+        """Open the port; clients find the drive at their next scan."""
         self.listener = listen(self.path, "USB port")
 
     def unplug(self) -> None:
-        """Pull the plug: every client loses the drive at once."""
+        """Close the port; every client loses the drive at once."""
         if self.listener is None:
             return
         self.path.unlink(missing_ok=True)
@@ -64,7 +63,7 @@ class FibrePort:
         self.clients.clear()
 
     def serve(self, client: socket.socket) -> bool:
-        """Answer the client's packets that have arrived; return False if the client is gone."""
+        """Answer the packets received from a client; return False if it has disconnected."""
         answer = self.front.answer
         try:
             for _ in range(_PACKETS):
@@ -75,16 +74,17 @@ class FibrePort:
                 if reply is not None:
                     client.send(reply)
         except BlockingIOError:
-            pass  # all is answered, or the client does not read and loses answers as on a real bus
+            pass  # all are answered, or the client reads too slowly and loses answers as on USB
         except OSError:
             return False
         return True
 
 
 class FibreHub:
-    """All USB plugs of one simulator.
+    """All USB ports of one simulator.
 
-    Without a client a poll costs almost nothing: the plugs are checked every `CHECK_EVERY` polls.
+    Without a client a poll costs almost nothing, because the ports are checked only every
+    `CHECK_EVERY` polls.
     """
 
     def __init__(self, ports: Sequence[FibrePort]) -> None:
@@ -104,7 +104,7 @@ class FibreHub:
         return self._epoll.fileno()
 
     def poll(self) -> None:
-        """Answer all received requests, and check the plugs periodically. Never waits."""
+        """Answer all received requests, and check the ports periodically, without waiting."""
         self._polls += 1
         if self._polls % CHECK_EVERY == 0:
             for port in self.ports:
@@ -119,7 +119,7 @@ class FibreHub:
                     self._admit(port, port.listener)
 
     def close(self) -> None:
-        """Pull all plugs for good."""
+        """Close all ports for good."""
         for port in self.ports:
             port.unplug()
         self._epoll.close()
@@ -129,7 +129,7 @@ class FibreHub:
             self._epoll.register(end, select.EPOLLIN)
 
     def _turn_if_wrong(self, port: FibrePort) -> bool:
-        """Put a plug in or pull it, to match its board; return True if it did not match."""
+        """Open or close a port to match its board; return True if it did not match."""
         if port.right:
             return False
         if port.listener is None:
@@ -140,13 +140,12 @@ class FibreHub:
         return True
 
     def _admit(self, port: FibrePort, listener: socket.socket) -> None:
-        """Admit a waiting client."""
         client = accept(listener)
         if client is not None:
             port.clients[client.fileno()] = client
             self._watch(client)
 
     def _serve(self, port: FibrePort, descriptor: int) -> None:
-        """Answer a client, unless its board has gone silent."""
+        """Answer a client, unless its board is silent."""
         if not self._turn_if_wrong(port) and not port.serve(port.clients[descriptor]):
             port.clients.pop(descriptor).close()

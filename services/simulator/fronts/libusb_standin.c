@@ -4,13 +4,13 @@
  * its serial number. One bulk transfer is one packet. A socket that accepts is a device
  * that is plugged in; one that closes is a device that was pulled out.
  *
- * Only what libodrive (odrive 0.6.11) calls is here, with the layouts of libusb 1.0.
- * Everything happens inside libusb_handle_events_timeout, on one file descriptor: an
- * epoll set of the sockets, a timer and a wake-up. Devices are never freed: few come
- * and go. System calls are the cost of it all, some hundred exchanges a second in each
- * of six processes: there are none that the next packet does not need.
+ * It has only the functions that libodrive (odrive 0.6.11) calls, with the layouts of
+ * libusb 1.0. Everything happens inside libusb_handle_events_timeout, on one file
+ * descriptor: an epoll set of the sockets, a timer and a wake-up event. Devices are never
+ * freed, because few come and go. System calls dominate the cost, with some hundred
+ * exchanges a second in each of six processes, so it avoids every needless call.
  *
- * libusb calls back with its locks released; so does this.
+ * Like libusb, it releases its lock during callbacks.
  */
 #define _GNU_SOURCE
 #include <dirent.h>
@@ -137,8 +137,8 @@ static device *devices[DEVICES];
 static int n_devices;
 static pending *queue; /* submitted transfers, oldest first */
 static int64_t armed_ms; /* when the timer fires next */
-static int woken;        /* the wake-up is set and was not heard yet */
-static int finishing;    /* the event loop looks at the whole queue again before it ends */
+static int woken;        /* the wake-up event is set and not handled yet */
+static int finishing;    /* the event loop checks the whole queue again before it returns */
 
 static int64_t now_ms(void)
 {
@@ -159,7 +159,7 @@ static void wake(void)
         woken = 1;
 }
 
-/* Have the timer fire no later than then. */
+/* Make the timer fire at ms or earlier. */
 static void fire_by(int64_t ms)
 {
     if (armed_ms && armed_ms <= ms)
@@ -169,7 +169,7 @@ static void fire_by(int64_t ms)
     timerfd_settime(the_context.timer_fd, TFD_TIMER_ABSTIME, &at, NULL);
 }
 
-/* Have the timer fire at the next deadline, or in time for the next look at the folder. */
+/* Make the timer fire at the next deadline, or for the next scan of the folder. */
 static void set_timer(void)
 {
     int64_t now = now_ms(), next = now + RESCAN_MS;
@@ -198,7 +198,7 @@ static void plug_in(const char *folder, const char *serial)
     d->fd = fd;
     d->address = 1 + n_devices % 120;
     d->handle.dev = d;
-    /* on edges: what nobody waits for yet is found when a transfer is submitted */
+    /* edge-triggered: data that arrives before its transfer is read when that is submitted */
     struct epoll_event e = {.events = EPOLLIN | EPOLLET, .data.ptr = d};
     epoll_ctl(the_context.epoll_fd, EPOLL_CTL_ADD, fd, &e);
     devices[n_devices++] = d;
@@ -224,7 +224,7 @@ static void pull_out(device *d)
     }
 }
 
-/* The oldest transfer that is not done at an endpoint of a device. */
+/* Return the oldest unfinished transfer at an endpoint of a device. */
 static pending *oldest(device *d, unsigned char endpoint)
 {
     for (pending *p = queue; p; p = p->next)
@@ -233,7 +233,7 @@ static pending *oldest(device *d, unsigned char endpoint)
     return NULL;
 }
 
-/* Try to finish a transfer: 1 if it is done, with its status set. Packets go in order, so
+/* Try to finish a transfer; return 1 if it is done, with its status set. Packets go in order, so
  * only the oldest at its endpoint may send or receive. */
 static int advance(pending *p)
 {
@@ -246,7 +246,7 @@ static int advance(pending *p)
         t->status = CANCELLED;
         return 1;
     }
-    if (d->fd >= 0 && !t->length) { /* a flush; an empty packet would mean the end of a socket */
+    if (d->fd >= 0 && !t->length) { /* a flush; an empty packet would mean the end of the stream */
         t->status = COMPLETED;
         return 1;
     }
@@ -292,7 +292,7 @@ int libusb_init(context **ctx)
     the_context.timer_fd = timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK);
     the_context.wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
     int own[] = {the_context.timer_fd, the_context.wake_fd};
-    for (int i = 0; i < 2; i++) { /* on edges: they need not be read */
+    for (int i = 0; i < 2; i++) { /* edge-triggered: they need not be read */
         struct epoll_event e = {.events = EPOLLIN | EPOLLET, .data.ptr = NULL};
         epoll_ctl(the_context.epoll_fd, EPOLL_CTL_ADD, own[i], &e);
     }
@@ -344,7 +344,7 @@ int libusb_handle_events_timeout(context *ctx, struct timeval *timeout)
     }
     for (int i = 0; i < n_devices; i++) {
         device *d = devices[i];
-        if (d->hung_up && !oldest(d, IN_ENDPOINT)) /* else that transfer finds it out */
+        if (d->hung_up && !oldest(d, IN_ENDPOINT)) /* else that transfer detects it */
             pull_out(d);
         int left = d->fd < 0 && !d->announced_left;
         d->announced_left |= left;
@@ -529,7 +529,7 @@ int libusb_submit_transfer(transfer *t)
         while (*end)
             end = &(*end)->next;
         *end = p;
-        /* hand it on now, or take what is there: it is reported in the event loop */
+        /* send or receive at once if possible; the event loop reports it */
         p->done = advance(p);
         if (p->done)
             wake();

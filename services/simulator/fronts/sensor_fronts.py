@@ -21,21 +21,22 @@ class FrameHub(Protocol):
     """Interface of the CAN bus to a simulated sensor."""
 
     def poll(self) -> object:
-        """Admit new clients and return the frames that they sent; never waits."""
+        """Admit new clients and return the frames that they sent; never blocks."""
 
     def broadcast(self, frames: list[tuple[int, bytes]]) -> None:
         """Send frames (id, data) to every client, as one packet."""
 
 
 BIAS_MAX: Final = 20.0
-"""Maximum zero offset of a load cell, N: uniform within +- this, constant, so tare matters."""
+"""Maximum zero offset of a load cell, N. Offsets are constant, and uniformly distributed between
+minus and plus this value."""
 
 
 class HarnessFront:
     """Six load cells between torso and operator, fixed to the torso."""
 
     def __init__(self, config: RobotConfig, hub: FrameHub, seed: int) -> None:
-        """Draw the zero offsets of this sensor; the seed is also that of the noise.
+        """Draw the zero offsets of this sensor; `seed` also seeds its noise.
 
         Raises:
             ConfigError: the geometry is singular.
@@ -48,23 +49,23 @@ class HarnessFront:
         self._noise = config.simulation.harness_noise
         self._random = np.random.default_rng(seed)
         self.bias = self._random.uniform(-BIAS_MAX, BIAS_MAX, stewart.N_LEGS)
-        """Zero offset of each leg, N."""
+        """Zero offset of each load cell, N."""
 
     def send(
         self,
         force_torso: Sequence[float] | npt.NDArray[np.float64],
         moment_torso: Sequence[float] | npt.NDArray[np.float64],
     ) -> None:
-        """Send one sample of the operator's force on the torso (3,), N, torso axes, and moment.
+        """Send one sample of the operator's force (3,), N, and moment (3,), N m, on the torso.
 
-        The moment (3,), N m, is about the harness point.
+        Both are in torso axes; the moment is about the harness point.
         """
         forces = self._G_inverse @ np.concatenate((force_torso, moment_torso))
         forces += self.bias
         forces += self._noise * self._random.standard_normal(stewart.N_LEGS)
         np.maximum(forces, -self._leg_force_max, out=forces)
         np.minimum(forces, self._leg_force_max, out=forces)
-        self._hub.poll()  # a load cell ignores requests, but clients that listen must be admitted
+        self._hub.poll()  # a load cell ignores requests, but new clients must be admitted
         self._hub.broadcast(pack_forces(forces.tolist()))
 
 
@@ -79,11 +80,11 @@ class ImuFront:
         roll, pitch, yaw = config.mounting
         mounting = _product(_about(2, yaw), _product(_about(0, roll), _about(1, pitch)))
         self._mounting = _product(tilt, mounting)
-        """Turns sensor axes into torso axes."""
+        """Quaternion that rotates sensor axes to torso axes."""
         self._random = np.random.default_rng((seed, 1))
 
     def send(self, world: World) -> None:
-        """Send one sample of the torso's orientation against gravity and its angular velocity."""
+        """Send a sample of the torso's orientation relative to gravity and its angular velocity."""
         noise = self._errors.noise * self._random.standard_normal(2)
         turned = _product(world.torso_against_gravity(), self._mounting)
         measured = _product(turned, _product(_about(0, noise[0]), _about(1, noise[1])))
@@ -95,7 +96,7 @@ class ImuFront:
 
 
 def _about(axis: int, angle: float) -> list[float]:
-    """Return the quaternion of a turn about x (0), y (1) or z (2), rad."""
+    """Return the quaternion of a rotation about x (0), y (1) or z (2), rad."""
     quaternion = [math.cos(0.5 * angle), 0.0, 0.0, 0.0]
     quaternion[1 + axis] = math.sin(0.5 * angle)
     return quaternion

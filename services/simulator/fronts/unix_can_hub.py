@@ -18,9 +18,9 @@ from shared.can.unix_can import PACKET_BYTES, Frame, Interface, pack_frames, unp
 from shared.exceptions import FleetError
 from shared.run_directory import private_files
 
-_PATH_BYTES = 107  # sun_path less its closing zero
+_PATH_BYTES = 107  # sun_path without its terminating zero
 _BACKLOG = 16
-_ROUNDS = 64  # a client that floods the bus must not hold up the simulator
+_ROUNDS = 64  # a client that floods the bus must not delay the simulator
 _FRAME_BYTES = 16
 _INT = struct.Struct("i")
 TXQUEUELEN: Final = 64
@@ -31,14 +31,15 @@ class UnixCanHub:
     """A CAN bus that forwards each client's frames to its owner and to the other clients.
 
     Raises:
-        FleetError: the path is in use, too long, or cannot be made.
+        FleetError: the path is in use, too long, or cannot be created.
 
     Attributes:
         dropped: packets that were not forwarded because a client's socket was full.
-        shared: True if the bus has nodes that its owner does not know; they acknowledge frames.
+        shared: True if the bus has nodes besides its owner's, which acknowledge frames.
         acknowledged: False while no node acknowledges. Frames then wait in the clients' sockets.
             They reach the bus in order when a node returns, unless the interface restarts first.
-        choked: True while frames of others fill the send queue: clients' sends fail with ENOBUFS.
+        choked: True while other nodes' frames fill the send queue: clients' sends fail with
+            ENOBUFS.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,7 +62,7 @@ class UnixCanHub:
         return len(self._clients)
 
     def poll(self) -> list[Frame]:
-        """Return the frames that clients have sent, in order; admit new clients. Never waits."""
+        """Return the frames that clients have sent, in order; admit new clients. Never blocks."""
         interface = self._interface
         if self._restarts != interface.restarts:
             self._restarts = interface.restarts
@@ -91,7 +92,7 @@ class UnixCanHub:
         self.broadcast_packet(pack_frames(frames))
 
     def broadcast_packet(self, packet: bytes) -> None:
-        """Send a packet made by `pack_frames` or alike to every client."""
+        """Send a packet in the format of `pack_frames` to every client."""
         for client in tuple(self._clients.values()):
             self._send(client, packet)
 
@@ -124,13 +125,13 @@ class UnixCanHub:
             self._epoll.register(client, select.EPOLLIN)
 
     def _receive(self, client: socket.socket) -> list[Frame]:
-        """Read and forward one packet of a ready client; remove a client that is gone."""
+        """Read and forward one packet of a ready client; remove a disconnected client."""
         try:
             packet = client.recv(PACKET_BYTES)
         except BlockingIOError:
             return []
         except ConnectionResetError:
-            return []  # reported once if it left frames unread; its own frames come next
+            return []  # reported once if the client left frames unread; its own frames follow
         except OSError:
             packet = b""
         if not packet:
@@ -151,19 +152,18 @@ class UnixCanHub:
         return waiting // _FRAME_BYTES
 
     def _discard(self) -> None:
-        """Discard the waiting frames."""
         for client in self._clients.values():
             while True:
                 try:
                     if not client.recv(PACKET_BYTES):
-                        break  # the client is gone; `poll` removes it
+                        break  # the client has disconnected; `poll` removes it
                 except OSError:
                     break
 
     def _send(self, client: socket.socket, packet: bytes) -> None:
         """Send without waiting; drop packets for which a slow client has no room.
 
-        A client that is gone is removed in `_receive`, after its last frames have been read.
+        `_receive` removes a disconnected client after reading its last frames.
         """
         try:
             client.send(packet)
@@ -179,14 +179,14 @@ class UnixCanHub:
 
 
 def listen(path: Path, what: str) -> socket.socket:
-    """Listen on a path for packets; remove the file of a simulator that is gone.
+    """Listen on a path for packets; remove the file of a simulator that has ended.
 
     Raises:
-        FleetError: the path is in use, too long, or cannot be made.
+        FleetError: the path is in use, too long, or cannot be created.
     """
     if len(os.fsencode(path)) > _PATH_BYTES:
         raise FleetError(
-            f"{what}: {path} is longer than the {_PATH_BYTES} bytes of a UNIX socket's path; "
+            f"{what}: {path} is longer than {_PATH_BYTES} bytes, the maximum for a UNIX socket; "
             "choose a shorter run directory"
         )
     _clear_stale(path, what)
@@ -205,7 +205,7 @@ def listen(path: Path, what: str) -> socket.socket:
 
 
 def accept(listener: socket.socket) -> socket.socket | None:
-    """Return one client from the queue, or None if it is gone; never blocks."""
+    """Return one client from the queue, or None if there is none; never blocks."""
     try:
         client, _ = listener.accept()
     except OSError:

@@ -1,9 +1,9 @@
-"""The USB bus of the emulated drives: a stand-in for libusb-1.0, built and loaded.
+"""Build and load the USB bus of the emulated drives: a stand-in for libusb-1.0.
 
-The genuine `odrive` package finds the emulated drives if the stand-in replaces the system's
-libusb-1.0 and `XRL_USB` names the folder of the plugs (`FOLDER` in the live directory). In another
-process its environment does both (`prepare`); in this one `load` loads the stand-in.
-`libusb_standin.c` describes the stand-in.
+The genuine `odrive` package finds the emulated drives if the stand-in (`libusb_standin.c`) replaces
+the system's libusb-1.0 and `XRL_USB` names the folder of the ports (`FOLDER` in the live
+directory). `prepare` returns an environment that does both in another process; `load` loads the
+stand-in into this process.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from shared.run_directory import live_dir
 
 SOURCE: Final = Path(__file__).with_name("libusb_standin.c")
 SONAME: Final = "libusb-1.0.so.0"
-"""Name by which libodrive loads it."""
+"""Name by which libodrive loads libusb."""
 FOLDER: Final = "usb"
-"""Folder of the plugs in the live directory; a plug's file name is the drive's serial number."""
+"""Folder of the ports in the live directory; a port's file name is the drive's serial number."""
 VARIABLE: Final = "XRL_USB"
-"""Environment variable in which the stand-in looks for the folder of the plugs."""
+"""Environment variable that names the folder of the ports."""
 
 BUILT: Final = "usb_standin"
-"""Folder of library and cache in the run directory."""
+"""Folder of the library and the cache in the run directory."""
 _COMPILER = "cc"
 _COMPILE_S = 60.0
 
 
 def build(folder: Path) -> Path:
-    """Return the stand-in in this folder, compiled if it is missing or older than its source.
+    """Return the path of the stand-in, compiled if it is missing or older than its source.
 
-    Several processes may build it at once, because the library is renamed into place.
+    Several processes may build it at once, because the finished library is renamed into place.
 
     Raises:
         FleetError: the C compiler is missing or fails, or the folder cannot be written.
@@ -63,7 +63,7 @@ def load(library: Path) -> None:
     """Load the stand-in into this process, before anything imports `odrive`.
 
     The package's own library then finds this libusb-1.0 and loads no other. `XRL_USB` must name
-    the folder of the plugs before the package is first used.
+    the folder of the ports before the package is first used.
     """
     ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
 
@@ -71,20 +71,20 @@ def load(library: Path) -> None:
 def prepare(run_dir: Path) -> dict[str, str]:
     """Return environment variables with which `odrive` in another process finds the drives.
 
-    The stand-in is built in the run directory of the fleet whose simulator has the drives.
+    The stand-in is built in `run_dir`, the run directory of the simulator's fleet.
     """
     library = build(run_dir / BUILT)
     paths = [str(library.parent), os.environ.get("LD_LIBRARY_PATH", "")]
     return {
         "LD_LIBRARY_PATH": os.pathsep.join(filter(None, paths)),
         VARIABLE: str(live_dir(run_dir) / FOLDER),
-        # the package caches drives' descriptors here, so emulated ones stay out of the home folder
+        # the package's cache of drive descriptors: emulated drives stay out of the home folder
         "XDG_CACHE_HOME": str(library.parent / "cache"),
     }
 
 
 def clear(run_dir: Path) -> None:
-    """Remove the build of `prepare`, and plugs left by a killed simulator."""
+    """Remove the build of `prepare`, and the ports that a killed simulator left."""
     shutil.rmtree(run_dir / BUILT, ignore_errors=True)
     folder = live_dir(run_dir) / FOLDER
     for plug in folder.glob("*"):
@@ -110,5 +110,6 @@ def _compile(library: Path) -> None:
             return
         wrong = f"failed on {SOURCE}; it needs C11 and the C library's headers:\n{result.stderr}"
     raise FleetError(
-        f'emulated USB: the C compiler `{_COMPILER}` {wrong.strip()}, or use driver = "odrive_can"'
+        'emulated USB needs a C compiler (driver = "odrive_can" does not): '
+        f"`{_COMPILER}` {wrong.strip()}"
     )

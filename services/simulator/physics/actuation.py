@@ -1,9 +1,9 @@
-"""From the drives' torques to the joints, and from the joints to the encoders. Pure.
+"""Torques from the drives to the joints, and angles from the joints to the encoders. Pure.
 
 Each of the 12 joint axes has its own rotor behind a spring with damping and play:
 
     I w' = tau_motor - tau_spring - d_m w - cogging - dry friction
-    tau_spring = k dead(theta - q) + b (w - q')        where the play is taken up
+    tau_spring = k dead(theta - q) + b (w - q')        b = 0 inside the play
     dead(x) = x - clip(x, -play/2, play/2)
 
 theta and w are the rotor's angle and rate at the joint. Both motors of a module are equal, so the
@@ -27,7 +27,7 @@ from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
 
 NOISE_ROWS: Final = 4093
-"""Number of noise samples, drawn at the start and then repeated: 4 s at 1 kHz, and a prime."""
+"""Number of noise samples: drawn at the start, then repeated every 4 s at 1 kHz. It is a prime."""
 
 
 class Actuation:
@@ -39,7 +39,7 @@ class Actuation:
     """
 
     def __init__(self, body: Body, dt: float) -> None:
-        """Set the true robot and the step, s."""
+        """Set the true robot and the time step `dt`, s."""
         n, plant, turns = N_JOINTS, body.plant, body.motor_from_joint
         drive = plant.drive
         self._turns = turns
@@ -69,8 +69,8 @@ class Actuation:
     def torque(self, motor_torque: Array, q: Array, v: Array) -> Array:
         """Advance by one step; return the torques on the joints (12,), N m.
 
-        With a flexible drivetrain they exclude `flexible.damping` times v. `motor_torque` (12,),
-        N m, is the drives' command.
+        With a flexible drivetrain, the body's integrator then subtracts `flexible.damping` times v.
+        `motor_torque` (12,), N m, is the drives' command.
         """
         wanted = np.matmul(self.tau_from_motor, motor_torque, out=self._wanted)
         if len(self._waiting):
@@ -79,7 +79,7 @@ class Actuation:
             self._waiting[-1] = wanted
             wanted[:] = late
         acting = self._acting
-        if self._lags:  # as at the step's start, so positions are right to second order in dt
+        if self._lags:  # torque at the step's start: positions are correct to second order in dt
             acting[:] = self._tau
             wanted -= self._tau
             wanted *= self._follow
@@ -121,12 +121,12 @@ class FlexibleDrivetrain:
 
     Attributes:
         theta: rotor angles at the joint (12,), rad.
-        rate: rad/s.
+        rate: rotor rates at the joint (12,), rad/s.
         damping: the spring's damping on the joint in this step (12,), N m s/rad: 0 in the play.
     """
 
     def __init__(self, config: Drivetrain, motor_from_joint: Array, dt: float) -> None:
-        """Set a finite stiffness, motor turns per joint angle (12, 12), and the step dt, s."""
+        """Build the step for a finite stiffness; `motor_from_joint` (12, 12) is in turns/rad."""
         self._graph = CompiledGraph(step_graph(config, motor_from_joint, dt))
         self.theta, self.rate, *self._arguments = self._graph.arguments
         self._theta_next, self._rate_next, self._tau, self.damping = self._graph.results
@@ -139,8 +139,8 @@ class FlexibleDrivetrain:
     def step(self, tau_motor: Array, q: Array, v: Array) -> Array:
         """Advance the rotors by one step; return the springs' torques on the joints (12,), N m.
 
-        The body's integrator adds `damping` times v. The next call overwrites the result. Motor
-        torques (12,), N m, are those at the joints.
+        The body's integrator subtracts `damping` times v. The next call overwrites the result.
+        `tau_motor` (12,), N m, are the motors' torques at the joints.
         """
         tau_now, q_now, v_now = self._arguments
         tau_now[:], q_now[:], v_now[:] = tau_motor, q, v
@@ -150,7 +150,7 @@ class FlexibleDrivetrain:
 
 
 def step_graph(config: Drivetrain, motor_from_joint: Array, dt: float) -> ca.Function:
-    """Return (theta, w, tau_motor, q, q') -> (theta, w, tau_spring + b w, b): one step."""
+    """Return one step: (theta, w, tau_motor, q, q') -> (theta, w, tau_spring + b q', b)."""
     theta, rate, tau_motor, q, v = (ca.SX.sym(name, N_JOINTS) for name in "trmqv")
     k, b = config.stiffness, config.damping_s * config.stiffness
     half = 0.5 * config.play

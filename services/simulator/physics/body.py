@@ -1,8 +1,8 @@
-"""The true robot: the robot file with the plant's errors applied, put on its feet.
+"""The true robot: the robot file with the plant's errors, placed on its feet.
 
-The world steps this body and has no robot file, so a controller's model and the truth can differ in
-every number. The generated model (`shared.robot.robot_model`) is nominal; this module changes its
-masses, friction, floor and feet.
+The world steps this body and reads no robot file, so the truth may differ from a controller's model
+in every number. The generated model (`shared.robot.robot_model`) is nominal; this module changes
+its masses, friction, floor and feet.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ else:
     mujoco = late("mujoco")
 
 MINOR_FRICTION = (0.005, 0.0001)
-"""m; torsional and rolling friction of a contact."""
+"""Torsional and rolling friction of a contact, m."""
 STICTION_TIME = 0.004
 """Time constant of the friction between sole and floor, s: twice the minimum at a 1 ms step.
 
 MuJoCo omits the term dJ/dt v from a contact's acceleration. A sole under a turning leg therefore
-creeps by the leg's centripetal acceleration times about half of this time. With the contact's own
-20 ms the feet crept back by 1.9 mm per squat, at any time step and `impratio`; with 4 ms, by 0.3
-mm. `SimTruth.over` is therefore measured from the feet's present position.
+creeps, at the leg's centripetal acceleration times about half of this time. With 20 ms, as in the
+contact's normal direction, the feet creep back by 1.9 mm per squat, at any time step and
+`impratio`; with 4 ms, by 0.3 mm. `SimTruth.over` is therefore measured from the feet's present
+position.
 """
 
 
 ITERATIONS: Final = 8
-"""Newton steps from `stand_pose` to soles that are flat to rounding."""
+"""Newton steps from `stand_pose` until the soles are flat to rounding errors."""
 
 
 class Body(NamedTuple):
@@ -49,7 +50,7 @@ class Body(NamedTuple):
     timestep: float
     """Duration of one `World.step`, s; the model's own step is this divided by `plant.steps`."""
     weight: float
-    """N"""
+    """Weight of the robot, N."""
     stand_q: Array
     """Joint angles near the initial stand (12,), rad."""
     ankles: Array
@@ -97,7 +98,7 @@ def body_of(config: RobotConfig, plant: PlantConfig) -> Body:
 
 
 def _set_gravity(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
-    """Lean gravity: a floor that rises along x by a pulls the robot towards -x."""
+    """Tilt gravity: on a floor that rises along x, it pulls the robot towards -x."""
     x, y = (math.sin(angle) for angle in plant.floor.slope)
     spec.option.gravity = [-GRAVITY * x, -GRAVITY * y, -GRAVITY * math.sqrt(1.0 - x * x - y * y)]
 
@@ -129,7 +130,7 @@ def _set_joints(spec: mujoco.MjSpec, plant: PlantConfig) -> None:
 def _feet(config: RobotConfig, plant: PlantConfig) -> tuple[Array, tuple[float, float]]:
     """Return the positions of the ankles (2, 3), m, and the yaws of the feet, rad.
 
-    The origin is midway between them in x and y, and at the left foot's height.
+    The origin is midway between the ankles in x and y, and at the left foot's height.
     """
     ankles = np.array(ankle_positions(config))
     half = 0.5 * (np.array(plant.feet.offset_right) - np.array(plant.feet.offset_left))
@@ -181,7 +182,7 @@ def _motor_from_joint(gear_ratio: float) -> Array:
 
 
 class FootPlacement:
-    """Places of the feet, and the solver of the legs' joint angles there.
+    """Solver for the legs' joint angles that put the feet at their positions.
 
     Attributes:
         q_index: indices of the 12 joint angles in MuJoCo's qpos.
@@ -191,7 +192,7 @@ class FootPlacement:
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, body: Body) -> None:
-        """Set MuJoCo's model and data, and the places of the feet."""
+        """Bind MuJoCo's model and data, and the positions of the feet."""
         self._model, self._data = model, data
         joints = [model.joint(name) for name in JOINTS]
         self.q_index = np.array([joint.qposadr[0] for joint in joints])
@@ -203,7 +204,7 @@ class FootPlacement:
     def stand_up(self, q: Array, lean: tuple[float, float]) -> None:
         """Place the robot, torso square to the floor, with the COM vertically above the ankles.
 
-        The solver starts from joint angles q (12,), rad; `lean` is gravity's x and y over its z.
+        The solver starts from joint angles q (12,), rad. `lean` is gravity's x and y divided by z.
         """
         data, model = self._data, self._model
         data.qpos[self.q_index] = q
@@ -212,12 +213,12 @@ class FootPlacement:
         self._flatten_soles()
         level = data.subtree_com[0][:2].copy()
         for _ in range(ITERATIONS if any(lean) else 0):
-            com = data.subtree_com[0]  # the legs move less than the torso
+            com = data.subtree_com[0]  # the COM moves less than the torso
             data.qpos[:2] += level + np.array(lean) * com[2] - com[:2]
             self._flatten_soles()
 
     def stand_at(self, q: Array) -> None:
-        """Place the robot, at rest, at joint angles (12,), rad, whose legs agree on the torso."""
+        """Place the robot at rest at joint angles (12,), rad, as `World.stand_at` describes."""
         data = self._data
         data.qpos[:7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
         data.qpos[self.q_index] = q
@@ -230,7 +231,7 @@ class FootPlacement:
         self._flatten_soles()
 
     def _flatten_soles(self) -> None:
-        """Move the legs until both ankles are in their places, soles flat."""
+        """Move the legs until both ankles are at their positions, soles flat."""
         data, model, wanted = self._data, self._model, self._wanted
         jacobian = np.zeros((6, model.nv))
         for _ in range(ITERATIONS):
@@ -249,7 +250,7 @@ class FootPlacement:
 
 
 def _without_yaw(rotation: Array, yaw: float) -> Array:
-    """Return Rz(yaw)^T rotation: the foot's small rotation from its place."""
+    """Return Rz(yaw)^T rotation: the foot's small rotation from flat."""
     if yaw == 0.0:
         return rotation
     c, s = math.cos(yaw), math.sin(yaw)

@@ -1,8 +1,8 @@
-"""The simulated operator: a hand that leads or is led, and weight rested on the harness.
+"""The simulated operator: a hand that leads or is led, and weight on the harness.
 
-The hand is a clipped spring-damper between a path and the harness point, in height and
-pitch (docs/simulator.md#reference-scenario), and sideways if the scenario says so. Behind it is a
-person with a mass, which yields in height. Pure.
+The hand is a clipped spring-damper between a path and the harness point, in height and pitch
+(docs/simulator.md#reference-scenario), and sideways if the scenario sets a sideways path. The
+person behind the hand has a mass and yields in height. Pure.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from shared.config.scenarios import Act, Lead
 from shared.config.sections import OperatorConfig
 
 BANDWIDTH: Final = 8.0
-"""rad/s; bandwidth of the critically damped system with which the hand follows requests."""
+"""Bandwidth of the critically damped system with which the hand follows requests, rad/s."""
 HEIGHT_MAX_RATE: Final = 0.25
-"""m/s; the hand then pulls with up to 70 N. At 0.5 m/s it is 150 N, where the planner lets go."""
+"""Maximum rate of a led hand's height, m/s: the hand pulls with up to 70 N. At 0.5 m/s it would
+pull with 150 N, the limit of the `harness` trip."""
 PITCH_MAX_RATE: Final = 1.0
-"""rad/s"""
+"""Maximum rate of a led hand's pitch, rad/s."""
 HEIGHTS: Final = (0.78, 1.2)
 """Range of the torso's height, m, within the legs' reach."""
 PITCHES: Final = (-0.3, 0.9)
 """Range of the torso's pitch, rad."""
 PUSH_MAX: Final = 120.0
-"""N, in each direction."""
+"""Maximum push in each direction, N."""
 PUSH_EXPIRES_S: Final = 0.3
 """Timeout of a push after its last message, s."""
 
 
 class LedHand(msgspec.Struct):
-    """Hand that somebody leads instead of the scenario, within limits and without jumps.
+    """Hand that follows an operator's requests, within limits and without jumps.
 
-    It follows the requests. Without a new request it stays in place, and its push ends.
-
-    Its fields, in this order, are `SimState.hand`.
+    Without a new request the hand stays in place, and its push ends. The fields, in this order, are
+    `SimState.hand`.
     """
 
     leads: bool = False
@@ -57,9 +57,9 @@ class LedHand(msgspec.Struct):
     push_left_s: float = 0.0
 
     def request(self, asked: HandLead, now: Lead) -> None:
-        """Accept a request, within the limits; a value that is not finite is ignored.
+        """Accept a request, within the limits, unless one of its values is not finite.
 
-        The first request takes over from the scenario's lead `now`.
+        The first request that leads takes over from the scenario's lead `now`.
         """
         if not all(map(math.isfinite, (asked.height, asked.pitch, *asked.push))):
             return
@@ -76,7 +76,7 @@ class LedHand(msgspec.Struct):
         self.push_left_s = PUSH_EXPIRES_S if self.force_x or self.force_y or self.force_z else 0.0
 
     def advance(self, dt: float) -> None:
-        """Advance by dt, s."""
+        """Advance by `dt`, s."""
         if self.leads:
             self.height, self.height_rate = follow(
                 self.wanted_height, self.height, self.height_rate, HEIGHT_MAX_RATE, dt
@@ -98,7 +98,7 @@ class LedHand(msgspec.Struct):
         )
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the fields as the log has them."""
+        """Return the fields as the log stores them."""
         return tuple(map(float, msgspec.structs.astuple(self)))
 
     @classmethod
@@ -118,10 +118,10 @@ class LedHand(msgspec.Struct):
 def follow(
     wanted: float, at: float, rate: float, rate_max: float, dt: float
 ) -> tuple[float, float]:
-    """Return position and rate of a coordinate dt s later, as it follows its target.
+    """Return position and rate, `dt` s later, of a coordinate that follows its target.
 
-    The follower is a critically damped second-order system with a rate limit. It is in closed form,
-    so it is stable for any dt.
+    The follower is a critically damped second-order system with a rate limit. Its solution is in
+    closed form, so it is stable for any `dt`.
     """
     # x'' = w^2 (wanted - x) - 2 w x', whose error is (a + b t) exp(-w t)
     error, w = at - wanted, BANDWIDTH
@@ -159,7 +159,7 @@ class Acting(NamedTuple):
 
 NO_ACT: Final = Acting()
 TREMOR_HZ: Final = 6.0
-"""A tremor of effort has 4 to 12 Hz."""
+"""Frequency of the tremor, Hz; a tremor of effort has 4 to 12 Hz."""
 RELAXED: Final = 0.25
 _GRIPS: Final = {"relax": RELAXED, "limp": 0.0, "let_go": 0.0}
 
@@ -194,10 +194,11 @@ REACH_S: Final = 0.4
 
 
 class Wearer(msgspec.Struct):
-    """The person's own mass behind the hand, which yields to the robot's force.
+    """The person's mass behind the hand, which yields to the robot's force.
 
-    It grips the robot in place and then joins the path. d is its height above the path:
-    m d'' = -m w^2 d - 2 zeta m w d' - f. Without a mass it follows the path exactly.
+    The hand grips the robot in place and then joins the path. Under its force f on the robot, its
+    height d above the path follows m d'' = -m w^2 d - 2 zeta m w d' - f. Without a mass the hand
+    follows the path exactly.
     """
 
     person: Person
@@ -214,7 +215,7 @@ class Wearer(msgspec.Struct):
     holds: bool = False
 
     def grip(self, above: float) -> None:
-        """Grip the robot where it is, `above` the path, m, unless the hand grips already."""
+        """Grip the robot where it is, `above` m above the path, unless the hand grips already."""
         if not self.holds:
             self.holds, self.reach = True, above
 
@@ -223,7 +224,7 @@ class Wearer(msgspec.Struct):
         return self.above + self.reach, self.rate - self.reach / REACH_S
 
     def step(self, dt: float, force_on_robot: float, assist: float, load: float = 0.0) -> None:
-        """Advance by dt, s, under the hand's force on the robot, N, up.
+        """Advance by `dt`, s, under the hand's force on the robot, N, up.
 
         The person rests a fraction of the requested assist, N, on the harness, with a lag. An
         unrequested `load`, N, is added.
@@ -274,7 +275,7 @@ class Operator:
         )
 
     def force_side(self, wanted: Lead, side: float, rate: float) -> float:
-        """Return the hand's force along world y, N; 0 if the scenario leads no side.
+        """Return the hand's force along world y, N; 0 if the scenario sets no sideways path.
 
         The harness point is at `side`, m, and moves at `rate`, m/s.
         """

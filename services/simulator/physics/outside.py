@@ -1,4 +1,4 @@
-"""External forces on the simulated torso: the hand, the rested weight, pushes and the hoist."""
+"""External forces on the simulated torso: the hand, the person's weight, pushes and the hoist."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from shared.bus.messages import Vector3, Vector4
 from shared.config.scenarios import Lead, Scenario, lead, push_at
 
 HOIST_STIFFNESS: Final = (2e4, 2e3)
-"""N/m and N m/rad of the hoist while it holds the torso."""
+"""Stiffness of the hoist while it holds the torso, N/m and N m/rad."""
 HOIST_DAMPING: Final = (2e3, 2e2)
-"""N s/m and N m s/rad."""
+"""Damping of the hoist, N s/m and N m s/rad."""
 HOIST_WEIGHT_SHARE: Final = 0.75
 """Fraction of the weight that the hoist carries; the soles stay on the floor."""
 
@@ -35,11 +35,11 @@ class Torso(NamedTuple):
     position: Array
     """(3,) m, world."""
     rotation: Array
-    """(9,), row by row; turns torso axes into world axes."""
+    """(9,), row by row; rotates torso axes to world axes."""
     rates: Array
     """(6,) velocity in world axes and angular velocity in torso axes."""
     wrench: Array
-    """(6,) N and N m, world, at the centre of mass: written by `OutsideForces`."""
+    """(6,) N and N m, world, at the centre of mass; `OutsideForces` writes it."""
     com: list[float]
     """Centre of mass (3,), m, torso axes; a plant may move it."""
 
@@ -84,23 +84,23 @@ class _Hoist(msgspec.Struct):
 
 
 class OutsideForces:
-    """The operator, pushes and the hoist.
+    """Forces of the operator, pushes and the hoist on the torso.
 
     Attributes:
         operator: the hand's spring-damper; may be replaced.
         asked: assist, N, and shift that another operator requests instead of the scenario.
-        led_hand: the hand that somebody leads instead of the scenario.
-        holds: the operator's hand is on the harness.
+        led_hand: the hand that an operator leads instead of the scenario.
+        holds: True if the operator's hand is on the harness.
         hand: the hand's present force.
         hand_side: the hand's force along world y, N.
         hand_ahead: the person's force along world x, N.
         push: the present push, N, world.
         harness_force: the operator's force on the torso at the harness point, N, torso axes.
-        harness_moment: N m, torso axes.
+        harness_moment: the operator's moment on the torso, N m, torso axes.
     """
 
     def __init__(self, body: Body, scenario: Scenario, torso: Torso) -> None:
-        """Hold the torso by the hoist at its present position."""
+        """Hold the torso at its present position, by the hoist."""
         self.scenario = scenario
         self._torso = torso
         self._harness_point = body.harness_point
@@ -126,7 +126,7 @@ class OutsideForces:
         return wanted
 
     def apply(self, scenario_s: float, dt: float) -> None:
-        """Advance by dt, s, and set the wrench on the torso.
+        """Advance by `dt`, s, and set the wrench on the torso.
 
         It uses plain floats, because it runs at every step and NumPy's calls on three numbers
         would cost more than the physics.
@@ -140,7 +140,7 @@ class OutsideForces:
         arm_x = r[0] * x + r[1] * y + r[2] * z
         arm_y = r[3] * x + r[4] * y + r[5] * z
         arm_z = r[6] * x + r[7] * y + r[8] * z
-        # MuJoCo applies outside forces at the body's centre of mass, which a plant may move
+        # MuJoCo applies external forces at the body's centre of mass, which a plant may move
         com_x, com_y, com_z = torso.com
         off_x = r[0] * com_x + r[1] * com_y + r[2] * com_z
         off_y = r[3] * com_x + r[4] * com_y + r[5] * com_z

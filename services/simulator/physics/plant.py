@@ -1,11 +1,11 @@
 """The plant: how the simulated robot differs from its controllers' model.
 
-A controller knows the robot file. The world is built from the robot file *and* a plant: joints that
-flex and play, friction, cogging, late torque, encoder noise, wrong zeros, wrong masses, a sloped
-floor, displaced feet, a person with a mass. No controller can see it: only the simulator reads it
+Controllers read the robot file. The world is built from the robot file *and* a plant: flexible
+joints with backlash, friction, cogging, delayed torque, encoder noise, wrong zeros, wrong masses, a
+sloped floor, displaced feet and a person with a mass. Only the simulator reads the plant
 (`tests/test_architecture.py`).
 
-`PlantConfig()` is the default, realistic; `IDEAL` is the controllers' own model. A TOML file or
+`PlantConfig()` is the default, realistic; `IDEAL` is rigid and has no errors. A TOML file or
 `--plant KEY=VALUE` (`plant_from`) changes single values. SI units.
 """
 
@@ -36,17 +36,17 @@ class Drivetrain(Section, frozen=True):
     """Drivetrain from motor to joint, the same on all 12 axes; the encoder is at the motor."""
 
     stiffness: Annotated[float, Range(500.0, math.inf, "N m/rad")] = 8000.0
-    """Stiffness of gear and chain, seen at the joint; inf is rigid. Catalogues give harmonic drives
-    of this torque class 10 000 to 30 000 N m/rad; with a chain stage, a half to a fifth of that
-    remains."""
+    """Stiffness of gear and chain, seen at the joint; inf is rigid. Catalogues list harmonic drives
+    of this torque class with 10 000 to 30 000 N m/rad; with a chain stage, a half to a fifth of
+    that remains."""
     damping_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.002
-    """Damping as a time: N m s/rad per N m/rad. Steel in grease has a loss factor of 1 to 5 %; at
-    the drivetrain's 37 Hz (8000 N m/rad on the rotor) 0.002 s is a damping ratio of 0.23 against
-    the rotor alone, chain and bearings included."""
+    """Damping divided by stiffness. Steel in grease has a loss factor of 1 to 5 %. At the
+    drivetrain's 37 Hz (8000 N m/rad on the rotor), 0.002 s is a damping ratio of 0.23 for the rotor
+    alone, including chain and bearings."""
     play: Annotated[float, Range(0.0, 0.1, "rad")] = math.radians(0.1)
     """Backlash, from stop to stop: 0.2 mm of a tensioned chain on a sprocket of 0.1 m."""
     rotor_inertia: Annotated[float, Range(0.01, 5.0, "kg m^2")] = 0.15
-    """Inertia of the rotors through the gear, at the joint, as `joint.armature`."""
+    """Inertia of the rotor, reflected to the joint, like `joint.armature`."""
     motor_friction: Annotated[float, Range(0.0, 20.0, "N m")] = 0.2
     """Dry friction on the motor's side, at the joint."""
     joint_friction: Annotated[float, Range(0.0, 20.0, "N m")] = 0.1
@@ -54,27 +54,27 @@ class Drivetrain(Section, frozen=True):
     motor_damping: Annotated[float, Range(0.0, 50.0, "N m s/rad")] = 0.3
     joint_damping: Annotated[float, Range(0.0, 50.0, "N m s/rad")] = 0.2
     cogging: Annotated[float, Range(0.0, 5.0, "N m")] = 0.2
-    """Amplitude per motor, at the joint: 0.01 N m of an outrunner through a gear of 17.5."""
+    """Amplitude per motor, at the joint: 0.01 N m of an outrunner, times a gear ratio of 17.5."""
     cogging_periods: Annotated[int, Range(1, 1000, "1")] = 42
     """Periods per motor turn: least common multiple of slots and poles of a small outrunner."""
 
 
 class DriveErrors(Section, frozen=True):
-    """Errors between a drive's commanded torque and the actual one."""
+    """Differences between a drive's commanded and actual torque."""
 
     lag_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.001
     """First-order lag: the current loop's bandwidth of 1000 rad/s (ODrive's default)."""
     delay_s: Annotated[float, Range(0.0, 0.02, "s")] = 0.0
     """Additional pure delay; the bus adds the delay of the frames."""
     torque_scale: Scale = 1.0
-    """Actual over commanded torque, as with a wrong torque constant."""
+    """Actual torque divided by commanded torque, as with a wrong torque constant."""
 
 
 class EncoderErrors(Section, frozen=True):
     """Errors of the encoders."""
 
     noise_counts: Annotated[float, Range(0.0, 100.0, "counts")] = 0.5
-    """Standard deviation; a capacitive encoder of 16384 counts moves by one count at rest."""
+    """Standard deviation; a capacitive encoder of 16384 counts varies by one count at rest."""
     zero_errors: tuple[Angle, ...] = (0.0,) * N_JOINTS
     """Reported minus true angle of each of the 12 joints, rad."""
 
@@ -101,12 +101,12 @@ class BodyErrors(Section, frozen=True):
 
 
 class Floor(Section, frozen=True):
-    """The floor. The world's z is the floor's normal, and gravity leans."""
+    """The floor. The world's z axis is the floor's normal, so a slope tilts gravity."""
 
     slope: tuple[Angle, Angle] = (0.0, 0.0)
     """Rise along x and along y, rad: (0.05, 0) is uphill in front."""
     step: Annotated[float, Range(-0.1, 0.1, "m")] = 0.0
-    """The floor under the right foot is higher by this."""
+    """Height of the floor under the right foot above the floor under the left foot."""
     friction: Annotated[float, Range(0.05, 2.0, "1")] = 0.8
     """Rubber on a dry floor; the robot file assumes 0.9."""
     contact_time: Annotated[float, Range(0.004, 0.1, "s")] = 0.02
@@ -114,7 +114,7 @@ class Floor(Section, frozen=True):
 
 
 class Feet(Section, frozen=True):
-    """Offsets of the feet from their places in the robot file.
+    """Offsets of the feet from their positions in the robot file.
 
     Only their difference matters, because the world's origin is midway between the ankles.
     """
@@ -128,7 +128,7 @@ class Person(Section, frozen=True):
     """The person behind the hand: a mass on legs that follows the scenario's path."""
 
     mass: Annotated[float, Range(0.0, 200.0, "kg")] = 80.0
-    """With 0 the hand follows the path exactly, whatever the force."""
+    """With 0 the hand follows the path exactly, at any force."""
     leg_frequency_hz: Annotated[float, Range(0.5, 20.0, "Hz")] = 2.5
     """Frequency of the person's mass on its legs: a standing person bounces at 2 to 3 Hz
     (whole-body vibration)."""
@@ -140,7 +140,7 @@ class Person(Section, frozen=True):
 
 
 class PlantConfig(Section, frozen=True):
-    """The whole plant; each default with its source or its reason."""
+    """The whole plant."""
 
     drivetrain: Drivetrain = Drivetrain()
     drive: DriveErrors = DriveErrors()
@@ -152,7 +152,8 @@ class PlantConfig(Section, frozen=True):
     person: Person = Person()
     heat: Heat = Heat()
     steps: Annotated[int, Range(1, 64, "1")] = 1
-    """Steps of world and drivetrain per `simulation.timestep`; more show whether 1 is enough."""
+    """Steps of world and drivetrain per `simulation.timestep`; use more to check that 1 is enough.
+    """
     seed: Annotated[int, Range(0, 1 << 31, "1")] = 0
     """Seed of the encoders' noise."""
 
@@ -165,7 +166,7 @@ IDEAL: Final = PlantConfig(
     floor=Floor(friction=0.9),
     person=Person(mass=0.0, load_scale=1.0, load_lag_s=0.0),
 )
-"""The controllers' own model, which shows only that the code follows the equations."""
+"""Rigid and without errors; it only shows that the code follows the equations."""
 
 NAMED: Final[Mapping[str, PlantConfig]] = {"realistic": PlantConfig(), "ideal": IDEAL}
 

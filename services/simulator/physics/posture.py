@@ -19,13 +19,13 @@ else:
     mujoco = late("mujoco")
 
 FALLEN_HEIGHT: Final = 0.60
-"""m; a crawl goes down to 0.79."""
+"""Height of the torso below which the robot has fallen, m; a crawl goes down to 0.79."""
 FALLEN_ANGLE: Final = 0.6
-"""rad of roll or yaw."""
+"""Roll or yaw of the torso above which the robot has fallen, rad."""
 FALLEN_TILT: Final = 0.6
-"""rad of a sole against the floor."""
+"""Tilt of a sole against the floor above which the robot has fallen, rad."""
 LEAST_N: Final = 1e-3
-"""N; a sole with a smaller load has no centre of pressure."""
+"""Minimum load of a sole for which a centre of pressure is computed, N."""
 
 
 class _MeasuredPosture(NamedTuple):
@@ -40,13 +40,12 @@ class _MeasuredPosture(NamedTuple):
     tilts: list[float]
     """Tilt of the right and the left sole against the floor, rad."""
     slip: float
-    """Largest distance of a foot from its place, m."""
+    """Largest distance of a foot from its initial position, m."""
     feet: Pair
-    """Mean offset of both feet from their places, x and y, m."""
+    """Mean offset of both feet from their initial positions, x and y, m."""
 
     @property
     def fallen(self) -> bool:
-        """True if the robot is down."""
         roll, _, yaw = self.angles
         return (
             self.torso[2] < FALLEN_HEIGHT
@@ -57,7 +56,7 @@ class _MeasuredPosture(NamedTuple):
 
 
 class SoleLoad(NamedTuple):
-    """Floor's force on one sole."""
+    """Force of the floor on one sole."""
 
     force: Vector3
     """N, world."""
@@ -66,7 +65,7 @@ class SoleLoad(NamedTuple):
 
 
 def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -> _MeasuredPosture:
-    """Return the posture after a step; `ankles` (2, 3), m, are the initial places of the feet."""
+    """Return the posture after a step; `ankles` (2, 3), m, are the feet's initial positions."""
     rotation = data.xmat[torso].reshape(3, 3)
     roll = math.asin(clamp(rotation[2, 1], -1.0, 1.0))
     pitch = math.atan2(-rotation[2, 0], rotation[2, 2])

@@ -1,7 +1,7 @@
 """The physical world in MuJoCo: the robot on free feet, and the forces on it.
 
 It steps the true robot (`services.simulator.physics.body`) without a robot file, bus or clock:
-`step` takes motor torques and advances by one time step.
+`step` applies motor torques for one time step.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class World:
         outside: external forces on the torso.
         joints: the joints in MuJoCo's memory.
         actuation: drivetrains and encoders.
-        placement: positions of the feet.
+        placement: solver that puts the feet at their positions.
         time: time since the start of the world, s.
     """
 
@@ -88,10 +88,10 @@ class World:
         self._fallen = False
         self._truths = 0
         self._level = _turn_between(-model.opt.gravity, np.array((0.0, 0.0, 1.0)))
-        """Quaternion that turns floor axes into axes whose z is up."""
+        """Quaternion that rotates floor axes to axes with z up."""
         x, y, z = model.opt.gravity.tolist()
         self._lean = (x / z, y / z)
-        # the hoist hangs vertically: on a slope it holds the torso off the floor's normal
+        # the hoist hangs vertically: on a slope the COM is off the floor's normal through the feet
         placement.stand_up(body.stand_q, self._lean)
         self.actuation.settle(data.qpos[placement.q_index])
         data.qpos[2] += lifted
@@ -107,9 +107,9 @@ class World:
     # ---- start and resume
 
     def stand_at(self, q: Array) -> None:
-        """Stand the robot still, soles flat, at joint angles q (12,), rad; no hoist.
+        """Place the robot at rest, soles flat, at joint angles q (12,), rad, without the hoist.
 
-        The two legs must agree on the torso, as `InverseKinematics` makes them.
+        Both legs must give the same torso pose; the angles of `InverseKinematics` do.
         """
         self.placement.stand_at(q)
         self.actuation.settle(self.data.qpos[self.joints.q_index])
@@ -212,7 +212,7 @@ class World:
         return actuation.encoders(q, v)
 
     def torso_against_gravity(self) -> list[float]:
-        """Return the quaternion (w, x, y, z) that turns torso axes into axes whose z is up."""
+        """Return the quaternion (w, x, y, z) that rotates torso axes to axes with z up."""
         measured = np.zeros(4)
         mujoco.mju_mulQuat(measured, self._level, self.joints.qpos[3:7])
         quaternion: list[float] = measured.tolist()
@@ -260,7 +260,7 @@ class World:
 
 
 def _turn_between(start: Array, end: Array) -> Array:
-    """Return the quaternion (w, x, y, z) of the shortest turn of one direction into another."""
+    """Return the quaternion (w, x, y, z) of the shortest rotation of `start` to `end`."""
     a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
     turn = np.concatenate(([1.0 + a @ b], np.cross(a, b)))
     return np.asarray(turn / np.linalg.norm(turn), float)

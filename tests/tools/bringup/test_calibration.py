@@ -141,7 +141,7 @@ def test_a_calibration_that_somebody_else_breaks_off_is_not_taken_for_one() -> N
     begun_s = board.clock()
     nothing: Any = lambda *_: None  # noqa: E731
     result = calibration.calibrate_board(board, AXES, Interrupts(), nothing, board.clock, pause)
-    assert "without an error: another program commands it" in result.why
+    assert "without an error: another program commands the axis" in result.why
     assert calibration.uncalibrated(board) == AXES
 
 

@@ -291,7 +291,8 @@ CASES: dict[str, tuple[Rows, list[str], tuple[str, ...]]] = {
     ),
     "no heartbeat": (bus(traffic(node9=NodeTraffic())), [f"{AXIS1}: heartbeat: wrong"], ()),
     "others on a silent bus": (
-        bus(STRANGERS), [f"{MODULE}: heartbeats: wrong"], ("nodes 0, 1 send instead",)
+        bus(STRANGERS), [f"{MODULE}: heartbeats: wrong"],
+        ("heartbeats come from other nodes (0, 1)",)
     ),
     "a failed motor though the axis error is 0": (
         bus(traffic(node8=axis(FAILED))), [f"{AXIS0}: errors: wrong"], ("MOTOR_FAILED",)

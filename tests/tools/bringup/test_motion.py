@@ -73,7 +73,7 @@ def test_limits_at_the_stops_are_wider_than_the_soft_ones(robot: RobotConfig) ->
     ("q", "words"),
     [
         (START, "^$"),
-        ((0.0, -0.21), r"would go to -0\.160.*--by with the other"),
+        ((0.0, -0.21), r"would go to -0\.160.*change the sign of --by"),
         ((0.0, -0.1), "outside.*xrl drive zero"),
         ((0.61, -1.0), "phi is at 0.610 rad, outside"),
         ((math.nan, -1.0), "outside"),

@@ -303,7 +303,7 @@ def test_over_usb_they_are_written_and_read_back(
     assert board.saves == 0, "a board that saves restarts, and has lost its zero"
     board.now |= SMALL
     board.deaf.add("axis0.controller.config.vel_limit")
-    with pytest.raises(DriveError, match="did not keep"):
+    with pytest.raises(DriveError, match="do not read back"):
         motion_runner.give_back(on_usb, MODULE, NOWHERE)
     found.boards.clear()
     with pytest.raises(DriveError, match=f"{SERIAL}: not connected"):

@@ -166,7 +166,7 @@ def test_legs_that_do_not_agree_which_way_is_up_are_refused(robot: RobotConfig) 
     tilted = {**HANGS, "hip": (0.0, 0.16)}
     left = {f"{kind}_left": seen_at(q, rest=rested(q)) for kind, q in tilted.items()}
     found = decide(robot, {**right, **left}, NOTHING)
-    assert "directions of up differ" in found["knee_left"].why
+    assert "up directions found from the two legs differ" in found["knee_left"].why
     assert found["ankle_left"].by == "unmoved"
 
 

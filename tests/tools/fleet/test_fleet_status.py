@@ -27,7 +27,8 @@ from shared.bus.messages import (
     ToolRoster,
     Wearing,
 )
-from shared.bus.session import Latest, place_of_tool
+from shared.bus.pubsub import Latest
+from shared.bus.session import place_of_tool
 from shared.clock import NS_PER_S, now_ns
 from shared.joints import MODULES
 from shared.robot.trip_table import JOINT_TRIPS, WEARING

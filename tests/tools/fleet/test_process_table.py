@@ -129,7 +129,12 @@ def test_a_service_that_this_fleet_does_not_have_is_refused(
         ('extra = "sim"', 'extra = "sundays"', "process[0].extra", "one of "),
         ('topic = "sim/truth"', 'topic = "joint/state"', "process[0].topic", "one of "),
         ('only = "simulation"', 'only = "sundays"', "process[0].only", "sundays"),
-        ('"{run}"', '"{Run}"', "process[0].command", "{Run} is not a placeholder here; one of {py"),
+        (
+            '"{run}"',
+            '"{Run}"',
+            "process[0].command",
+            "{Run} is not a placeholder here; must be one of {py",
+        ),
         ('"{run}"', '"{module}"', "process[0].command", "{module} is not a placeholder here"),
         ('name = "simulator"', 'name = "{simulator}"', "process[0].name", "one of {module}"),
         ('name = "harness"', 'name = "knee_left"', "process", "'knee_left' is in it twice"),
@@ -146,7 +151,7 @@ def test_a_bad_row_is_refused_with_its_key(
 def test_a_run_directory_too_long_for_sockets_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     plan(Path("/tmp") / ("long" * 25))  # its sockets lie elsewhere, in memory
     monkeypatch.setattr(run_directory, "_MEMORY_FOLDERS", ())
-    with pytest.raises(FleetError, match=r"\d+ bytes too long"):
+    with pytest.raises(FleetError, match=r"\d+ B too long"):
         plan(Path("/tmp") / ("long" * 25))
 
 

@@ -206,5 +206,5 @@ def test_a_person_who_pulls_harder_at_rest_than_they_lead_is_told_so() -> None:
 
 
 def test_without_squats_and_a_rest_nothing_is_measured() -> None:
-    with pytest.raises(RunError, match=r"0 squats and 0 s at rest in a crouch.*three times"):
+    with pytest.raises(RunError, match=r"squats: 0, .*crouch: 0 s, .*three times"):
         thresholds_of(cast(RunLog, MadeLog(lambda _t: 0.0)), ROBOT)

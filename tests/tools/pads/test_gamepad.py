@@ -182,13 +182,13 @@ def test_a_button_or_an_axis_that_the_mapping_lacks_is_refused(device: VirtualPa
 
 def test_a_pad_is_found_by_a_part_of_its_name_and_needs_no_display(device: VirtualPad) -> None:
     assert find_pad(None) == find_pad("Virtual") == device.index
-    with pytest.raises(FleetError, match="no gamepad 'Xbox': Virtual Controller at"):
+    with pytest.raises(FleetError, match="no gamepad 'Xbox'; found: Virtual Controller at"):
         find_pad("Xbox")
     assert not sdl2.SDL_WasInit(sdl2.SDL_INIT_VIDEO)
 
 
 def test_without_the_package_or_a_pad_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(FleetError, match="no gamepad: none that this user may read; join group"):
+    with pytest.raises(FleetError, match="no gamepad; found: none that this user may read; join"):
         find_pad(None)
     monkeypatch.setitem(sys.modules, "sdl2", None)
     with pytest.raises(MissingPackageError, match=r"`pad` .*; or lead with the keyboard: --keys"):

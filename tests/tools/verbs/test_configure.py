@@ -136,7 +136,7 @@ def test_a_backup_is_for_the_modules_that_it_has(
     assert configure.modules_of(flags, robot, saved_as(SERIAL.lower())) == (MODULE,)
     assert configure.modules_of(flags, robot, None) == MODULES
     other = dataclasses.replace(flags, module=("hip_left",))
-    with pytest.raises(DriveError, match="no hip_left, only knee_left"):
+    with pytest.raises(DriveError, match="no backup of hip_left in it, only of knee_left"):
         configure.modules_of(other, robot, saved_as(SERIAL))
 
 
@@ -158,7 +158,7 @@ def test_a_backup_of_another_firmware_is_refused(robot: RobotConfig) -> None:
 def test_a_board_that_is_not_there_or_not_known_is_refused(robot: RobotConfig) -> None:
     other = next(row.serial_number for row in robot.module if row.name != MODULE)
     absent = FoundBoards({}, {SERIAL: "not plugged in"}, (other, "0000000000AA"))
-    with pytest.raises(DriveError, match=r"plugged in; plugged in and in no .*: 0000000000AA\."):
+    with pytest.raises(DriveError, match=r"plugged in; plugged in, but in no .*: 0000000000AA\."):
         configure.boards_of(robot, [MODULE], absent)
     board = BoardInMemory({})
     for board.firmware in ((0, 6, 10), (0, 5, 1)):  # newer, and older than its settings' names

@@ -56,7 +56,7 @@ def test_the_tick_is_the_last_at_or_before_the_time(log: RunLog) -> None:
 @pytest.mark.parametrize(
     ("at", "words"),
     [
-        ("0.3", "network: not impaired here"),
+        ("0.3", "network: not impaired at this time"),
         ("0.6", "network: planner->joints delay=25ms, 0.40 to 1.00 s"),
         ("1.8", "network: all partition, 1.50 to 1.90 s"),
     ],

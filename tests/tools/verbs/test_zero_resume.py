@@ -158,7 +158,7 @@ def test_legs_that_were_cut_off_at_work_are_resumed_once_they_have_swung(
     assert bench.run(resume=True, untouched=True, level=True) == FAULT_EXIT_CODE
     assert max(bench.errors()[1:3]) == 9.0
     said = capsys.readouterr().out
-    assert re.search(r"hip_left: refused: no rest is stored for it.*--swing", said, re.DOTALL)
+    assert re.search(r"hip_left: refused: its last rest is not stored.*--swing", said, re.DOTALL)
     watch = zeroing.watch
 
     def pushed(*args: object) -> object:
@@ -244,7 +244,10 @@ KEPT: dict[str, Value] = {"axis0.encoder.config.phase_offset": 4021}
     [
         (None, "^$"),
         (Identity("3A0000000005", KEPT), "^$"),
-        (Identity("3A0000000009", KEPT), "board 3A0000000009, not 3A0000000005"),
+        (
+            Identity("3A0000000009", KEPT),
+            "board 3A0000000009, but its zero is of board 3A0000000005",
+        ),
         (
             Identity("3A0000000005", {"axis0.encoder.config.phase_offset": 3977}),
             "calibrated since.*phase_offset is 3977, but was 4021",

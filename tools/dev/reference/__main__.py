@@ -6,7 +6,9 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from itertools import groupby
 from pathlib import Path
+from textwrap import dedent
 from typing import Any, Final
 
 from services.joint.failsafe import TRANSITIONS, Event
@@ -25,42 +27,41 @@ FOLDER: Final = Path(__file__).resolve().parents[3] / "docs" / "reference"
 _FAULTS: Final = """\
 # Faults
 
-`xrl faults` prints this page's tables. Lockstep tests hold the robot to each row of the first two
-tables, and `xrl study crash` does so live. A module that lost torque is never re-armed
-automatically, even if its service restarts: a person mends the cause, then restarts the service.
+`xrl faults` prints these tables. `tests/lockstep/test_faults.py` tests each drive fault, and
+`xrl study crash` tests drive faults and lost services live.
 """
 _MODES: Final = """\
 # Modes of a joint service
 
-The joint service acts on one event a cycle, the gravest first (the table's order). An event that a
-mode does not list changes nothing. The reasons behind the machine: [](../architecture.md#modes).
+A joint service acts on the first of a cycle's events in this table. An empty cell means no change.
+After `FALLEN` a module only damps. See [causes](topics.md#cause) and
+[modes](../architecture.md#modes).
 """
 _SHARED_BY: Final = 2
-"""A flag that as many verbs have with the same meaning is described once."""
+"""Minimum number of verbs with the same flag and meaning for a common description."""
 _VERBS: Final = """\
 # Verbs
 
-`xrl` is `.venv/bin/xrl`; `./deploy/demo`, `up`, `down`, `status` and `kill` are the same verbs with
-the environment made first. `xrl --version` prints version and commit, `xrl help VERB` what
-`xrl VERB --help` does.
+`xrl` is `.venv/bin/xrl`. The scripts `demo`, `up`, `down`, `status` and `kill` in `deploy/` make
+the environment if needed, then run the verb. `xrl --version` prints version and commit.
+`xrl help VERB` and `xrl VERB --help` print a verb's help.
 
 | exit code | meaning |
 |---|---|
 | 0 | success |
-| 1 | a robot fell, or is about to fall; nothing else |
-| 2 | bad input, a person declined, the fleet cannot start, or the system refused a request |
-| 3 | a check found a fault or a difference, or no message came |
-| 70 | a fault of `xrl` itself: please report its traceback |
-| 129 | its terminal is gone, as after a dropped ssh session |
-| 130, 141, 143 | Ctrl-C; the reader of its output ended (`xrl ... \\| head`); SIGTERM |
+| 1 | a robot fell or is about to fall |
+| 2 | an error, such as invalid input or a full disk; or a declined question |
+| 3 | a check or part of the work failed, a figure missed its limit, or no message arrived |
+| 70 | a bug in `xrl`: please report its traceback |
+| 129 | the terminal closed, as after a dropped ssh session |
+| 130, 141, 143 | Ctrl-C; closed output pipe (`xrl ... \\| head`); SIGTERM |
 
-A pipe or a file gets whole tables, without frames and colours. Control characters in a log, on the
-bus or in a file's name are printed escaped, such as `\\u001b`.
+Tables in a pipe or a file have full width, without frames and colours. Control characters from
+logs, the bus and file names are printed escaped, such as `\\u001b`.
 """
 
 
 def _faults_page() -> Iterator[str]:
-    """Yield the page of faults: what happens, and what a person does."""
     yield _FAULTS
     for title, about, headings, rows in fault_sections(load(DEFAULT_CONFIG).trips):
         yield f"## {title}\n\n{about}\n"
@@ -70,7 +71,6 @@ def _faults_page() -> Iterator[str]:
 
 
 def _modes_page() -> Iterator[str]:
-    """Yield the page of the joint service's state machine."""
     docs = cell_docs(Event)
     rows = []
     for event in Event:
@@ -102,18 +102,28 @@ def _verbs_page() -> Iterator[str]:
     for name, found in flags.items():
         own = [row for row in found.items() if row not in shared]
         also = [f"{flag.split()[0].rstrip('`')}`" for flag, _ in found.items() & shared.keys()]
+        about, lines = (
+            (text or "").splitlines()[1:]
+            for text in (parsers[name].description, parsers[name].epilog)
+        )
+        if not (found or any(about) or lines):
+            continue  # only a group of verbs
         yield f"\n## xrl {name}\n"
-        about = " ".join((parsers[name].description or "").splitlines()[1:])
-        if about:
-            yield about + "\n"
+        yield from _about(about)
         if own:
             yield from table("flag | meaning", own)
             yield ""
         if also:
             yield f"Also {', '.join(sorted(also))}.\n"
-        lines = (parsers[name].epilog or "").splitlines()[1:]
         if lines:
             yield "\n".join(["```sh", *(line.strip() for line in lines), "```"])
+
+
+def _about(lines: Iterable[str]) -> Iterator[str]:
+    """Yield a description's paragraphs, and its indented lines as blocks of text."""
+    for indented, group in groupby(filter(str.strip, lines), lambda line: line.startswith("  ")):
+        text = dedent("\n".join(group)).strip()
+        yield f"```text\n{text}\n```\n" if indented else text + "\n"
 
 
 def _flags(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
@@ -129,7 +139,7 @@ def _flags(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
 def _parsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
     """Yield name and parser of every verb below a parser."""
     actions = parser._subparsers._group_actions if parser._subparsers else []  # noqa: SLF001
-    choices: list[Any] = [action.choices for action in actions]  # of sub-parsers it is a dictionary
+    choices: list[Any] = [action.choices for action in actions]  # a dictionary for sub-parsers
     for found in choices:
         for below in found.values():
             yield below.prog.removeprefix("xrl "), below
@@ -143,22 +153,24 @@ PAGES: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "faults.md": _faults_page,
     "modes.md": _modes_page,
 }
-"""Lines of the generated files, by name."""
+"""Function that yields the lines of each generated file, by file name."""
 
 
 def text_of(name: str) -> str:
-    """Return a generated file."""
+    """Return the text of a generated file."""
     return "\n".join(PAGES[name]()).rstrip() + "\n"
 
 
 def main() -> int:
-    """Write the pages; with `--check` say which differ: a fault."""
+    """Write the pages, or with `--check` report those that differ; return the exit code."""
     parser = FlagParser(
         prog="python -m tools.dev.reference",
-        description="Write docs/reference from the code. A test holds that it is up to date.",
+        description="Write docs/reference from the code. A test checks that it is up to date.",
     )
     parser.add_argument(
-        "--check", action="store_true", help=f"write nothing; exit code {FAULT_EXIT_CODE} if old"
+        "--check",
+        action="store_true",
+        help=f"write nothing; exit code {FAULT_EXIT_CODE} if a page is out of date",
     )
     args = parser.parse_args()
     old = []

@@ -28,6 +28,6 @@ def summary(documented: object) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return the text on one line, ready for a table's cell; names of pages become links."""
+    """Return the text on one line, for a table's cell; names of pages become links."""
     text = " ".join(text.split()).replace("|", "\\|")
     return re.sub(r"docs/(\w[\w-]*)\.md(#[\w-]+)?", r"[\1](../\1.md\2)", text)

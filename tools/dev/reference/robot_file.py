@@ -1,4 +1,4 @@
-"""The page of the robot file: every key with type, unit, range and default."""
+"""Page of the robot file: every key with type, unit, range and default."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ from tools.dev.reference.markdown import cell_docs, one_line, summary, table
 _INTRODUCTION: Final = """\
 # The robot file
 
-`deploy/robot.toml` holds the whole robot; `--config FILE` names another one. An unknown key or an
-impossible value is refused with the file, the key, the value and what would be right. `assumed`
-lists the values that the paper does not give; measure them on your robot and take them off the
-list.
+`deploy/robot.toml` describes the whole robot; `--config FILE` selects another file. Its comments
+give the reasons for many values.
 
-A unit of `1` is a plain number. *Default* is what holds when the key is missing; a key without a
-default must be there. *Shipped* is the value in `deploy/robot.toml`.
+The unit `1` marks a plain number. *Default* is the value of a missing key; a key without a default
+is required. *Shipped* is the value in `deploy/robot.toml`; long values are omitted. Of similar
+tables, such as `[stand.ankle]` and `[stand.knee]`, only the first is shown.
 
-After a change of one of these run `xrl gains`, because the gain schedule beside the file depends on
-them: {inputs}.
-`law.lead_easing` does so only beyond the value for which the schedule was made.
+The gain schedule beside the file depends on these keys, so run `xrl gains` after you change one:
+{inputs}.
+For `law.lead_easing` this is necessary only above the value for which the schedule was made.
 """
 _LONGEST: Final = 60
-"""Characters of a shipped value that fit a cell."""
+"""Maximum characters of a shipped value in a cell."""
 _NOT_IN_THE_FILE: Final = "gain_schedule"
 """Read from the file beside it (`shared.config.gain_schedule`)."""
 
@@ -50,7 +49,7 @@ def _schedule_inputs() -> str:
     config = config_file.load(DEFAULT_CONFIG)
     keys: dict[str, list[str]] = {}
     aside = msgspec.structs.replace(config.mass, payload_com=(0.1, 0.0, 0.0))
-    # a key that the schedule forgets while it is zero counts as well
+    # also include the key that the schedule omits while it is zero
     for key in inputs_of(msgspec.structs.replace(config, mass=aside)):
         section, _, name = key.partition(".")
         keys.setdefault(section, []).append(name)

@@ -1,4 +1,4 @@
-"""The page of topics and messages, from `shared.bus.topics` and the message structs."""
+"""Page of topics and messages, from `shared.bus.topics` and the message structs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ ENUMS: Final[tuple[type[IntEnum], ...]] = tuple(
 _INTRODUCTION: Final = """\
 # Topics and messages
 
-Every key on the bus is `xrl/<robot>/<topic>`; `*` stands for a module's name. Payloads are JSON,
-SI units, times in ns on the sender's monotonic clock, enumerations as integers. A suffix is a unit
-(`_ns`, `_ms`, `_s`, `_n` for newtons). The rate is the nominal one of `deploy/robot.toml`.
-All topics are recorded unless the table says otherwise.
+A topic's key is `xrl/<robot>/<topic>`; `*` stands for a module. Payloads are JSON in SI units; a
+suffix such as `_ms` or `_n` (newtons) names the unit. Enumerations are integers. Rates are nominal.
+`operator` is any tool that may write. The recorder and tools may read every topic; all are
+recorded.
 """
 
 
@@ -35,7 +35,7 @@ def page() -> Iterator[str]:
     yield from table(headings, map(_topic_row, topics.TOPICS))
     yield ""
     yield "## Messages\n"
-    yield "Each message begins with the two fields of the base:\n"
+    yield "Each message begins with these fields:\n"
     yield from _fields(messages.Message, own=True)
     for kind in dict.fromkeys(topic.type for topic in topics.TOPICS):
         yield from _message(kind)
@@ -57,7 +57,7 @@ def _topic_row(topic: Topic) -> tuple[str, ...]:
         topic.priority.name.lower().replace("_", " "),
         _names(topic.writers),
         _names(topic.readers),
-        f"{one_line(topic.why)}{'' if topic.recorded else ' (not recorded)'}",
+        f"{one_line(topic.why)}{'' if topic.recorded else ' (recorded unpacked)'}",
     )
 
 
@@ -90,7 +90,7 @@ def _fields(kind: type[msgspec.Struct], *, own: bool = False) -> Iterator[str]:
     base = () if own else messages.Message.__struct_fields__
     fields = [name for name in kind.__struct_fields__ if name not in base]
     if not fields:
-        yield "No fields of its own.\n"
+        yield "No further fields.\n"
         return
     enums = {name: ENUMERATIONS.get((kind, name)) for name in fields}
     types = {

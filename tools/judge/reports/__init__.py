@@ -1,1 +1,1 @@
-"""The report of a run as one page, and its 3-D scene for viewers."""
+"""Report page and animated picture of a run."""

@@ -54,7 +54,7 @@ class TimelineEvent(NamedTuple):
 
 
 class Events:
-    """The events of a run, which is added in parts, in order."""
+    """The events of a run; `add` receives the run in parts, in order."""
 
     def __init__(self) -> None:
         self._found: list[TimelineEvent] = []

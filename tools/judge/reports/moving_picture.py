@@ -24,7 +24,7 @@ from tools.logs.run_log import RunLog
 
 Point = tuple[float, float]
 FRAMES_S: Final = 12.5
-"""Frames per second; a GIF counts in hundredths of a second."""
+"""Frames per second; a GIF shows each frame for a multiple of 0.01 s."""
 SCALE: Final = 2
 """Frames are drawn larger by this factor and then reduced, for smooth lines."""
 SIZE: Final = (640, 400)
@@ -52,7 +52,8 @@ def write_gif(
 ) -> int:
     """Draw a run from the start of its scenario, and return the number of frames.
 
-    The pose comes from the simulated world, else from the legs. `progress` receives 0 .. 1.
+    The pose comes from the simulated world, or else from the legs' kinematics. `progress` receives
+    the fraction that is drawn.
     """
     events: list[RunEvent] = log.messages(topics.RUN_EVENT)
     began = next((event.t_ns for event in events if event.kind == RunEventKind.STARTED), 0)
@@ -82,7 +83,7 @@ def write_gif(
                 optimize=True,
             )
     except OSError as error:
-        raise RunError(f"{path}: cannot write it: {error.strerror or error}") from None
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from None
     return len(flat)
 
 

@@ -1,5 +1,5 @@
 "use strict";
-// The page: one uPlot for each panel, all with the same time shown and the same cursor.
+// The report page: one uPlot for each panel; all share the time range and the cursor.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const [BEGIN, END] = data.span[1] > data.span[0] ? data.span : [data.span[0], data.span[0] + 1];
@@ -20,7 +20,7 @@ function show(from, to) {
   for (const panel of view.panels) panel.resize();
 }
 
-// Move the time shown by a fraction of its length, and make it longer or shorter.
+// Shift the time range by a fraction of its length, and scale its length by a factor.
 function move(fraction, factor = 1) {
   const length = view.to - view.from, middle = view.from + (0.5 + fraction) * length;
   show(middle - factor * length / 2, middle + factor * length / 2);
@@ -28,7 +28,8 @@ function move(fraction, factor = 1) {
 
 const fourDigits = (value) => String(Number(value.toPrecision(4)));
 
-// Draw on a plot's canvas in CSS pixels: `paint` gets the context, the plot's area, and x of t.
+// Draw on a plot's canvas in CSS pixels. `paint` receives the context, the plot area, and a
+// function that returns x at time t.
 function paintOn(plot, paint) {
   const { ctx, bbox } = plot, ratio = ctx.canvas.width / plot.width;
   const [left, top] = [bbox.left / ratio, bbox.top / ratio];
@@ -52,7 +53,7 @@ function dashedLine(ctx, colour, dash, x0, y0, x1, y1) {
   ctx.setLineDash([]);
 }
 
-// Event marks: a line in every plot; in the first one also the names, in up to three rows.
+// Draw each event as a vertical line. The first plot also shows the events' names, in up to three rows.
 function paintMarks(plot, isFirst) {
   paintOn(plot, (ctx, box, x) => {
     const rowEnds = [-Infinity, -Infinity, -Infinity];
@@ -71,7 +72,7 @@ function paintMarks(plot, isFirst) {
   });
 }
 
-// Limits within the plot: a dotted line each, and its name where no other name is.
+// Draw each limit in view as a dotted line. A name that would overlap another is left out.
 function paintLevels(plot, levels) {
   const { min, max } = plot.scales.y, placed = [];
   paintOn(plot, (ctx, box) => {
@@ -89,7 +90,7 @@ function paintLevels(plot, levels) {
   });
 }
 
-// One row of coloured bars for each module; the state's name where it fits.
+// Draw the rows of coloured bars. A bar shows its name if it is wide enough.
 function paintBars(plot, rows) {
   paintOn(plot, (ctx, box, x) => {
     rows.forEach(([label, bars], number) => {
@@ -156,9 +157,9 @@ class Panel {
           document.getElementById("cursor").textContent = text;
         }],
         setSelect: [({ cursor, select, posToVal }) => {
-          if (!cursor.event || !select.width) return;  // only the plot that was dragged in
+          if (!cursor.event || !select.width) return;  // only the plot in which the user dragged
           const ends = [select.left, select.left + select.width].map((px) => posToVal(px, "x"));
-          queueMicrotask(() => show(...ends));  // when uPlot is done with the other plots
+          queueMicrotask(() => show(...ends));  // after uPlot has updated the other plots
         }],
       },
     };
@@ -182,7 +183,7 @@ class Panel {
     return dashed ? `linear-gradient(90deg, ${ink} 40%, transparent 40% 60%, ${ink} 60%)` : ink;
   }
 
-  // Range of the value axis, from the least and the greatest value in view.
+  // Return the range of the value axis for the smallest and largest values in view.
   range(low, high) {
     if (low === null) [low, high] = [Infinity, -Infinity];
     for (const [value, , shown] of this.spec.levels) {
@@ -191,7 +192,7 @@ class Panel {
     if (low > high) return [0, 1];
     if (this.spec.reach) high = Math.max(low, Math.min(high, this.spec.reach));
     const size = Math.max(Math.abs(low), Math.abs(high));
-    const least = Math.max(1e-3, size * 1e-4);  // smaller changes are rounding
+    const least = Math.max(1e-3, size * 1e-4);  // smaller differences are rounding errors
     const pad = Math.max((high - low) * 0.06, (least - (high - low)) / 2);
     return [low - pad, high + pad];
   }

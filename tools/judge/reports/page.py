@@ -90,7 +90,7 @@ class _PanelData:
 
 
 def thinned(t: Array, values: Array, span: Span) -> tuple[Array, Array]:
-    """Return the finite samples of a line; of many, only the extremes of each short interval."""
+    """Return a line's finite samples; of a long line, only the extremes of each short interval."""
     finite = np.isfinite(values)
     t, values = t[finite], values[finite]
     width_s = 2.0 * (span.end - span.begin) / POINTS
@@ -112,7 +112,7 @@ def with_gaps(t: Array, values: Array) -> tuple[Array, Array]:
 
 
 class Page:
-    """The page of a run, which is added in parts, in order."""
+    """The page of a run; `add` receives the run in parts, in order."""
 
     def __init__(self, zero_ns: int | None = None, span: Span | None = None) -> None:
         self._zero_ns, self._span = zero_ns, span

@@ -30,7 +30,7 @@ GAP_S: Final = 0.1
 AGE_REACH: Final = 1.2
 """Top of the panel of ages, as a multiple of the maximum usable age."""
 AGE_MAX_MS: Final = 50.0
-"""Maximum usable age if the log does not contain its robot's."""
+"""Maximum usable age if the log does not contain its robot."""
 TORQUE_DURATION_MIN_S: Final = 0.02
 """Shorter total times at the torque limit are not reported, s."""
 COLOURS: Final[Mapping[str, str]] = {
@@ -55,7 +55,7 @@ class Beyond(NamedTuple):
 
 
 Beyonds = Sequence[tuple[Beyond, NDArray[np.bool_]]]
-"""Samples of a line that are beyond each of its limits."""
+"""Limits of a line, each with a mask of the samples beyond it."""
 
 
 class Line(NamedTuple):
@@ -154,7 +154,7 @@ def _hand(run: RunData) -> Panel:
     if not len(t):
         t, force = run.times(topics.WRENCH), run.wide(topics.WRENCH, "force", 3)
         lines = [Line(f"hand, {axis}", t, force[:, n], n) for n, axis in enumerate("xyz")]
-        return Panel(title, unit, "By the harness sensor, torso axes.", lines=lines)
+        return Panel(title, unit, "By the harness sensor, in torso axes.", lines=lines)
     force = run.wide(topics.SIM_TRUTH, "operator_force", 3)
     load, carried = run.columns(topics.SIM_TRUTH, "", "load_n", "harness_force_z")
     requested, assist = run.columns(topics.PLANNER_STATUS, "", "assist_requested_n", "assist_n")
@@ -174,7 +174,7 @@ def _hand(run: RunData) -> Panel:
             Line("assist requested", t_p, requested, 6, dashed=True),
             Line("assist applied", t_p, assist, 7, hidden=True),
         ]
-    return Panel(title, unit, "World axes, on the torso.", lines=lines, levels=levels)
+    return Panel(title, unit, "On the torso, in world axes.", lines=lines, levels=levels)
 
 
 def _states(run: RunData) -> Panel:
@@ -209,7 +209,6 @@ def _bars(t: Array, codes: Array, names: type[Mode | PlannerMode]) -> list[Bar]:
 
 
 def _ages(run: RunData) -> Panel:
-    """Return the age of each module's newest command."""
     lines = []
     for number, module in enumerate(MODULES):
         (age_ns,) = run.columns(topics.JOINT_STATE, module, "age_ns")
@@ -225,7 +224,6 @@ def _ages(run: RunData) -> Panel:
 
 
 def _torques(run: RunData) -> Panel:
-    """Return the torque of each module against its limit."""
     lines = []
     most = run.robot.joint.tau_module_max if run.robot is not None else np.inf
     for number, module in enumerate(MODULES):
@@ -257,7 +255,7 @@ def _certificate(run: RunData) -> Panel:
         beyond = [(Beyond(f"under {least[number]:g}"), is_under)]
         lines.append(Line(name, t, margin, number, beyond=beyond))
         if math.isfinite(least[number]):
-            levels.append(Level(least[number], f"least, {name}", shown=True))
+            levels.append(Level(least[number], f"minimum, {name}", shown=True))
     return Panel(
         "Certificate margin",
         note="Stability without the planner: 1 is the required stiffness, at 0 the robot falls.",

@@ -32,8 +32,8 @@ class RunData:
     def __init__(self, log: RunLog, zero_ns: int | None = None, span: Span | None = None) -> None:
         self.log = log
         self.course: Course | None = None
-        """Trajectory of the simulated world; None if the log lacks it or its scenario never
-        started."""
+        """Trajectory of the simulated world; None if the log lacks it, or if the scenario never
+        started and the robot did not fall."""
         self.without_course = ""
         """Reason why `course` is None."""
         try:

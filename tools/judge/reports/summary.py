@@ -63,7 +63,7 @@ class Judge:
             self._why_not = str(error)
 
     def verdict(self, *, whole: bool = True) -> _RunVerdict:
-        """Return the verdict; a part of a run (`whole` is False) only has figures."""
+        """Return the verdict; for a part of a run (`whole` is False), only its figures."""
         if not self._summaries:
             said = merged_figures(self._wearer).describe() if self._wearer else ""
             return _RunVerdict(f"No verdict: {self._why_not}", None, [], wearer=said)

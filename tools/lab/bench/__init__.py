@@ -1,1 +1,1 @@
-"""Cost of each part of the fleet: warm and cold, also of two revisions in turn."""
+"""Benchmarks of the fleet and its parts, also against another git revision."""

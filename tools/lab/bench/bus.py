@@ -196,7 +196,7 @@ command, us; commands that missed the first possible cycle; CPU time as a fracti
 
 
 def _run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[float], int]:
-    """Put a state in every other cycle, take the newest command in each; count from `begin_ns`."""
+    """Send a state every other cycle, read a command every cycle; count from `begin_ns`."""
     put, take = end[0](f"state_{name}"), end[1](f"command_{name}")
     latencies, missed = list[float](), 0
     due, before_ns, cycle = time.monotonic_ns(), 0, 0
@@ -216,7 +216,7 @@ def _run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[f
 
 
 def _run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[float], int]:
-    """Put six commands when six new states have arrived."""
+    """Send six commands whenever six new states have arrived."""
     takes = [end[1](f"state_{module}") for module in MODULES]
     puts = [end[0](f"command_{module}") for module in MODULES]
     fresh, last_ns = set[int](), 0
@@ -233,7 +233,7 @@ def _run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[f
 
 
 def measure(transport: str, seconds: float) -> dict[str, float]:
-    """Run the pattern once, for some seconds after the warm-up; return its figures."""
+    """Run the pattern once, for `seconds` after the warm-up; return its figures."""
     names = (*MODULES, PLANNER)
     with (
         tempfile.TemporaryDirectory(prefix="xrl-bus-") as folder,
@@ -244,7 +244,6 @@ def measure(transport: str, seconds: float) -> dict[str, float]:
 
 
 def _run_process(transport: str, folder: str, name: str, seconds: float) -> Seen:
-    """Run one process of the pattern, and return its figures."""
     scheduling.raise_priority(20)
     end = TRANSPORTS[transport][0](name, Path(folder))
     gc.freeze()
@@ -271,8 +270,8 @@ class BusFlags(BenchFlags):
     """Transports to measure, and for how long."""
 
     transport: Annotated[tuple[str, ...], Arg(choices=tuple(TRANSPORTS), metavar="NAME")] = ()
-    """measure only this transport; may be repeated (default: all that are installed; those besides
-    Zenoh and datagrams come with the extra `bench`)"""
+    """only this transport; repeatable (default: all installed; all but Zenoh and datagrams need the
+    extra `bench`)"""
     seconds: Duration = 10.0
     """duration of each run"""
 

@@ -1,4 +1,4 @@
-"""`xrl bench fleet`: leads the whole fleet live, and reads its cost and quality from the record."""
+"""`xrl bench fleet`: leads the whole fleet live, and measures its cost and quality."""
 
 from __future__ import annotations
 
@@ -53,9 +53,10 @@ class FleetFlags(AgainstFlags):
     """Scenario and pace."""
 
     scenario: Annotated[str, Arg(metavar="NAME|FILE")] = "squat"
-    """scenario, as for `xrl demo` (default: squat, the paper's Fig. 7)"""
+    """file, or name of a scenario, shipped or in scenarios/ beside the robot file (default: squat,
+    the paper's Fig. 7)"""
     pace: Annotated[float, Range(PACE_MIN, 1.0, ""), Arg(metavar="X")] = 1.0
-    """clock rate of the fleet; it is not lowered on full cores, and the targets are for 1"""
+    """clock rate of the fleet, not lowered if the cores are full; the targets apply at 1"""
 
 
 def run(flags: FleetFlags) -> int:
@@ -74,7 +75,7 @@ def run(flags: FleetFlags) -> int:
     ]
     note = (
         "Medians of the turns. CPU: in percent of one core. Late: later than two periods. "
-        "Age: of a command, from the state that it echoes to the cycle that takes it. "
+        "Age: of a command, from the state that it echoes to the cycle that applies it. "
         "Messages alone: `xrl bench bus --transport zenoh`, without laws, drives and a recorder."
     )
     return finish(flags, [row_of(figure, here, there) for figure in kept], note, console)
@@ -84,7 +85,7 @@ def measure(demo: Sequence[str]) -> Turn:
     """Lead this tree's fleet through a scenario, live, and read its record.
 
     Raises:
-        RunError: the robot fell, or there was no run.
+        RunError: the demo ended with an exit code other than 0, for example after a fall.
     """
     with tempfile.TemporaryDirectory(prefix="xrl-fleet-") as folder:
         out = Path(folder) / "run"
@@ -108,10 +109,10 @@ def figures(summary: Mapping[str, Any], first_use: Array) -> Turn:
 
 
 def first_use_ms(log: RunLog) -> Array:
-    """Return the age of each command in the cycle that took it, ms, of all modules: (n,) floats.
+    """Return the age of each command in the cycle that applied it, ms, of all modules: (n,) floats.
 
     The age counts from the module's state that the command echoes. Commands to hold, and commands
-    that are missing in the log, are left out.
+    that are missing from the log, are left out.
     """
     ages = []
     for module in MODULES:

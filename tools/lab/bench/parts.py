@@ -3,7 +3,7 @@
 A loop that calls a function a thousand times in a row finds its code and data in the cache. In the
 fleet each cycle follows a sleep, and ten processes share two cores: a planner tick of 294 us warm
 took 568 us live. Before a cold call the bench sweeps more memory than a core's own cache holds, and
-sleeps; that reproduced the live figure. Times are the calling thread's CPU time.
+sleeps; this reproduced the live figure. Times are the calling thread's CPU time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SECONDS: Final = 3.0
 PIECE_S: Final = 0.5
 """Virtual time of a lockstep run for one figure, s."""
 BATCH: Final = 64
-"""Messages per batch, as the recorder takes in one cycle of 12 ms."""
+"""Messages per batch; the recorder takes about 80 in one cycle of 20 ms."""
 MODULE: Final = "knee_right"
 
 
@@ -54,7 +54,7 @@ SWEPT_BYTES: Final = 6 << 20
 ASLEEP_S: Final = 1.5e-3
 """Sleep before each cold call, s: most of a joint service's cycle."""
 CALLS: Final = {"warm": 200, "cold": 60}
-"""Calls per turn: a few tenths of a second."""
+"""Calls of each part per turn; they take a few tenths of a second."""
 YARDSTICK_CALLS: Final = 20
 
 
@@ -148,7 +148,7 @@ class _KeptManager(DriveManager):
 
 
 def _planner_tick(recorded: Recorded, _stack: ExitStack, split: str = "certified") -> Repeated:
-    """Six states in, six commands and a status out; the hand leads."""
+    """Time a planner tick, from six states to six commands and a status, while the hand leads."""
     law = msgspec.structs.replace(recorded.robot.law, split=split)
     planner = Planner(msgspec.structs.replace(recorded.robot, law=law), session=1)
     inputs = itertools.cycle(recorded.ticks)
@@ -169,7 +169,7 @@ def _planner_tick(recorded: Recorded, _stack: ExitStack, split: str = "certified
 
 
 def _joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
-    """A command's JSON and a sample in; a target and, every other cycle, a state's JSON out."""
+    """Time a cycle from command JSON and sample to target and, every other cycle, state JSON."""
     manager, decoder = DriveManager(recorded.robot, MODULE), Decoder(JointCommand)
     arguments = [one.arguments for one in recorded.cycles]
     payloads = [b"" if command is None else encode(command) for _, _, command, *_ in arguments]
@@ -187,7 +187,7 @@ def _joint_cycle(recorded: Recorded, _stack: ExitStack) -> Repeated:
 
 
 def _drive_exchange(recorded: Recorded, stack: ExitStack) -> Repeated:
-    """Both axes' encoder frames in, the frames of a target out, over the simulator's CAN bus."""
+    """Time reading two encoder frames and writing a target over the simulator's CAN bus."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrl-bench-")))
     hub = stack.enter_context(UnixCanHub(folder / "can"))
     nodes = recorded.robot.module_named(MODULE).node_ids
@@ -211,7 +211,7 @@ def _drive_exchange(recorded: Recorded, stack: ExitStack) -> Repeated:
 
 
 def _simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
-    """One step of the world with its twelve emulated axes, without frames and bus."""
+    """Time one step of the world and its twelve emulated axes, without frames and bus."""
     world, bank = recorded.fleet.world, recorded.fleet.bank
 
     def once() -> None:
@@ -221,7 +221,7 @@ def _simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
 
 
 def _recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
-    """Write `BATCH` messages from the bus to the file."""
+    """Time writing `BATCH` messages to the file."""
     writer = _writer(recorded.robot, stack)
     outbox, messages = RecordedMessages(recorded.robot.name), itertools.cycle(recorded.messages)
 
@@ -233,7 +233,7 @@ def _recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
 
 
 def yardstick(_recorded: Recorded, _stack: ExitStack) -> Repeated:
-    """`YARDSTICK_CALLS` solutions of a 12 x 12 system: the machine's present speed."""
+    """Time `YARDSTICK_CALLS` solutions of a 12 x 12 system: a measure of the machine's speed."""
     A = np.eye(12) + 0.01 * np.arange(144.0).reshape(12, 12) / 144.0
     b = np.ones(12)
 
@@ -269,7 +269,7 @@ PARTS: Final = (
 )
 
 LOCKSTEP: Final = {"lockstep": 10.0, "lockstep with a record": 7.0}
-"""Targets of docs/results.md#targets, times real time."""
+"""Targets of docs/results.md#targets, as multiples of real time."""
 FIGURES: Final = (
     *(
         Figure(f"{part.name}, {how}", "us", target)
@@ -291,7 +291,7 @@ class Bench:
         self._writer = _writer(robot, stack)
 
     def turn(self) -> Turn:
-        """Return the cost of each part, us, and the speeds of lockstep, times real time."""
+        """Return each part's cost, us, and the speeds of lockstep as multiples of real time."""
         found: Turn = {
             name: _lockstep_speed(self._robot, self._squat, self._writer if record else None)
             for name, record in zip(LOCKSTEP, (False, True), strict=True)

@@ -1,4 +1,4 @@
-"""Tables of `xrl bench`: medians of turns, ratios to another revision, targets; and the flags."""
+"""Flags and tables of `xrl bench`: medians, targets, and ratios to another revision."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ class Row(NamedTuple):
     other: float | None = None
     """The other revision's median."""
     ratio: float | None = None
-    """Median over the turns of this time divided by the other; below 1 this tree is faster."""
+    """Median over the turns of this tree's figure divided by the other's; for a speed, the inverse.
+    Below 1 this tree is better."""
     target: float | None = None
 
     @property
@@ -102,7 +103,7 @@ class BenchFlags(Flags):
     """Number of rounds, and where the figures go."""
 
     rounds: Annotated[Count | None, Arg(metavar="N")] = None
-    """rounds of each (default: 9 for the parts, else 3)"""
+    """number of rounds (default: 9 for `xrl bench`, else 3)"""
     json: Annotated[Path | None, parsed(_writable, "FILE")] = None
     """also write the figures to this file"""
 
@@ -111,8 +112,8 @@ class AgainstFlags(BenchFlags, ConfigFlags):
     """A tree to measure, and a tree to compare it with."""
 
     against: Annotated[str | None, Arg(metavar="REV")] = None
-    """also measure a git revision by its own bench, in turn with this tree, and print the ratios;
-    both run in this environment"""
+    """also measure a git revision with its own bench, in turn and in this environment; print the
+    ratios"""
     strict: Annotated[bool, Arg(help=f"exit code {FAULT_EXIT_CODE} if a target is missed")] = False
 
 
@@ -174,7 +175,7 @@ def unpacked(revision: str) -> Iterator[Path]:
 
 
 def run_tree(tree: Path, words: Sequence[str], module: str = "tools.cli") -> str:
-    """Run `xrl`, or another module, of a source tree; return its output. It also receives Ctrl-C.
+    """Run `xrl`, or another module, of a source tree; return its output. Ctrl-C reaches it too.
 
     Raises:
         RunError: it ended with an error, or timed out.
@@ -194,7 +195,7 @@ def run_tree(tree: Path, words: Sequence[str], module: str = "tools.cli") -> str
         raise RunError(f"{tree}: {module} has not ended after {PATIENCE_S:g} s") from None
     if process.returncode:
         last = " / ".join(output.strip().splitlines()[-3:])
-        raise RunError(f"{tree}: {module} ended with {process.returncode}: {last}")
+        raise RunError(f"{tree}: {module} ended with exit code {process.returncode}: {last}")
     return output
 
 
@@ -227,7 +228,7 @@ def _cell(value: float | None, unit: str) -> str:
 
 
 def print_table(console: Console, columns: Mapping[str, Iterable[Text | str]], note: str) -> None:
-    """Print cells by heading, left-aligned without a heading, and a note below them."""
+    """Print columns under their headings (left-aligned if the heading is empty), then a note."""
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in columns:
         shown.add_column(heading, justify="right" if heading else "left", no_wrap=True)

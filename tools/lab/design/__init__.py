@@ -1,1 +1,1 @@
-"""Design of the gains by `xrl gains`: their schedule, certificates, and withstood pushes."""
+"""Gain design for `xrl gains`: schedule, certificates and push limits."""

@@ -1,17 +1,17 @@
 """Computes the body stiffness needed to balance, from the paper's section IV. Pure.
 
-The robot leans as an inverted pendulum of mass m and height z_max over two ankles. The ankles are
-not part of m, because they do not move:
+The robot leans as an inverted pendulum of mass m and height z over two ankles. The ankles are not
+part of m, because they do not move:
 
-    theta_max  = arcsin(2 tau_max / (m g z))     the ankles' torque is used up
-    theta_edge = arctan(half sole / z)           the COM is over the sole's edge
+    theta_max  = arcsin(2 tau_max / (m g z))     lean that uses up the ankles' torque
+    theta_edge = arctan(half sole / z)           lean that puts the COM over the sole's edge
     tau_edge   = m g z / 2 sin(theta_edge)       each ankle's torque there
     K_ank_min  = tau_edge / theta_edge           N m/rad, each ankle
     K_x_min    = 2 K_ank_min / z^2               N/m, in the body's coordinates
-    K_x(tau)   = 2 tau_max / (theta_edge z^2)    uses tau_max at the edge
+    K_x(tau)   = 2 tau_max / (theta_edge z^2)    uses up tau_max at the edge
 
-The paper's formula for theta_edge prints l_foot, but its text and its number (2.81 deg) use w_foot
-/ 2. Here x uses l_foot and y uses w_foot.
+The paper's formula for theta_edge prints l_foot, but its text and its number (2.81 deg) use
+w_foot / 2. Here x uses l_foot and y uses w_foot.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class BodyStiffness(NamedTuple):
     """Stiffness design for one direction."""
 
     theta_max: float
-    """rad; NaN if the ankles could hold any lean."""
+    """rad; NaN if the ankles can hold any lean."""
     theta_edge: float
     """rad"""
     tau_edge: float
@@ -40,7 +40,7 @@ class BodyStiffness(NamedTuple):
 
 
 def for_robot(config: RobotConfig) -> dict[str, BodyStiffness]:
-    """Return the minimum body stiffness that balances along x and y, upright with straight legs.
+    """Return the stiffness design along x and y, upright with straight legs.
 
     The soles are side by side: x uses half their length, y half their width. As in the paper, the
     distance between the legs, which helps in y, is left out.

@@ -1,17 +1,17 @@
 """Dynamic certificate: the sampled-data loop is stable on flexible joints. Offline and pure.
 
 The static certificate (`services.planner.law.certificate`) requires stiffness. This one requires
-that no motion of `tools.lab.design.sampled_loop` grows. It covers thirteen heights of the schedule,
-upright and pitched by 1.2 rad, and every drivetrain (`robustness.stiffness`), hand and delay of the
-robot file:
+that no motion of the loop in `tools.lab.design.sampled_loop` grows, except a slow drift along the
+led directions. It covers thirteen heights of the schedule, upright and pitched by 1.2 rad, and
+every drivetrain (`robustness.stiffness`), hand and delay of the robot file:
 
 - with every feedback torque, and with tau_coupled alone, scaled by `gain_margin`;
 - with the delay scaled by `delay_margin`, also while F_I is at its limit;
 - in HOLD with the services, and with the drives alone;
 - on request, parked: as in TRACK, but height and pitch are closed, and nothing may drift.
 
-While an encoder is blind, which its drive reports only after `BLIND_S`, a motion may grow, by
-at most `BLIND_GROWTH_MAX` until then.
+A drive reports a blind encoder only after `BLIND_S`. Until then a motion may grow by a factor of
+at most `BLIND_GROWTH_MAX`.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ from tools.lab.design.sampled_loop import (
 )
 
 DELAY_MIN_S: Final = 2e-3
-"""s, from a sample to the first use of its command, over a bus without delay."""
+"""Delay from a sample to the first use of its command, over a bus without delay, s."""
 DRIVE_STEP_S: Final = 1e-3
-"""s. The modelled drive loop is as slow as the simulated one; the firmware's 8 kHz is less
+"""Period of the modelled drive loop, s, as in the simulator; the firmware's 8 kHz is less
 critical."""
 DRIFT_HZ: Final = 0.05
 """A slower motion is a drift, not an oscillation: the leading operator closes that loop."""
@@ -63,7 +63,7 @@ BLIND: Final = tuple(
     f"HOLD, {MODULES[i // 3]} with {('no encoder', 'one encoder', 'the other encoder')[i % 3]}"
     for i in range(3 * N_LEG // 2)
 )
-"""Modes: modules of one leg, each with both axes blind, and with either axis blind."""
+"""Modes: HOLD, with both axes or either axis of one module of a leg blind."""
 BLIND_S: Final = 0.051
 """Time for which an axis stays armed and blind, s (docs/drives.md)."""
 BLIND_GROWTH_MAX: Final = 1.5
@@ -73,8 +73,8 @@ SEEN: Final = (
     0.5 * np.array([[1.0, 1.0], [1.0, 1.0]]),
     0.5 * np.array([[1.0, -1.0], [-1.0, 1.0]]),
 )
-"""Measured (phi, theta) of a module per (phi, theta), with both motors blind and with either one
-blind: docs/law.md (3)."""
+"""Matrices from true to measured (phi, theta) of a module, with both motors blind and with either
+one blind: docs/law.md (3)."""
 
 
 class Design(NamedTuple):
@@ -96,10 +96,10 @@ class StiffnessNode(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """One case in which every motion of the loop must decay."""
+    """One case that the certificate covers."""
 
     mode: str
-    """One of `TRACK`, `HELD` or `BLIND`."""
+    """One of `TRACK`, `PARKED`, `HELD` or `BLIND`."""
     node: StiffnessNode
     half: int
     stiffness: float
@@ -166,9 +166,9 @@ def nodes_of(
 
 
 def stands_of(config: RobotConfig, poses: Poses, node: PoseNode, M: Array) -> list[Stand]:
-    """Return the last of the poses, a node, linearised without and with the full assist.
+    """Return a node, the pose last solved by `poses`, linearised without and with the full assist.
 
-    M (6, 6) is the inertia along p at the node (`services.planner.law.model.BodyInertia`).
+    M (6, 6) is the node's inertia along p (`services.planner.law.model.BodyInertia`).
     """
     J, J_harness = poses.kinematics.J.copy(), poses.kinematics.J_harness.copy()
     S = np.array(config.law.S, float)
@@ -181,7 +181,6 @@ class DynamicCertificate:
     """The conditions of a robot, and the loop in each condition."""
 
     def __init__(self, config: RobotConfig, nodes: list[StiffnessNode]) -> None:
-        """Set the robot and its poses."""
         self._config = config
         self._nodes = nodes
         self._wanted = config.robustness
@@ -260,7 +259,7 @@ class DynamicCertificate:
         *,
         stop_above: float = np.inf,
     ) -> _DynamicVerdict:
-        """Return the condition with the slowest decay, or the first above `stop_above`, 1/s."""
+        """Return the verdict with the largest excess, or the first above `stop_above`, 1/s."""
         worst: _DynamicVerdict | None = None
         for condition in self.conditions(modes):
             verdict = self.judge(condition, design)
@@ -279,7 +278,7 @@ class DynamicCertificate:
                     yield Condition("TRACK", node, 0, stiffness, delay, NO_HAND, NOMINAL)
 
     def sway(self, design: Design) -> float:
-        """Return the rate (1/s, negative) of the TRACK oscillation with the slowest decay."""
+        """Return the growth rate of the worst oscillation in TRACK, 1/s; negative if it decays."""
         cases = (c for c in self.conditions(TRACK) if c.gains == NOMINAL and c.integral
                  and c.delay_s <= self._wanted.delay_ms / 1e3)  # fmt: skip
         return max(self.loop(c, design).growth(c.gains, DRIFT_HZ).rate for c in cases)
@@ -319,7 +318,7 @@ class DynamicCertificate:
             yield case._replace(gains=Gains(torque=self._wanted.gain_margin))
 
     def drivetrain(self, stiffness: float) -> DrivetrainModel:
-        """Return the drivetrain of a stiffness, N m/rad."""
+        """Return the drivetrain with a stiffness, N m/rad."""
         joint, wanted = self._config.joint, self._wanted
         return DrivetrainModel(
             stiffness,

@@ -1,6 +1,6 @@
-"""Standing poses over COM height and pitch: inputs of the certificates, bounds of the commands.
+"""Computes standing poses over COM height and pitch, for the certificates and the command bounds.
 
-This runs offline. The joint services check commands against the bounds.
+Runs offline. The joint services check commands against the bounds.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from tools.reach import ReachSolver
 REACH_STEP: Final = 0.005
 """m; resolution of the ends of the height range."""
 MID_HEIGHT_FRACTION: Final = 0.8
-"""Fraction of the straight leg: height of the pose from which every other pose is approached."""
+"""Height of the first pose, as a fraction of the straight leg."""
 
 BODY_RATES: Final = (0.3, 0.3, 1.0, 0.5, 2.0, 0.5)
-"""m/s and rad/s along p; a faster motion is a fall, not a lead. A squat led by a person reaches
-0.3 m/s."""
+"""Maximum rates along p, m/s and rad/s; a faster motion is a fall. A person leads a squat at up
+to 0.3 m/s."""
 THETA_BINS: Final = 12
-"""Bins of a joint's range of theta."""
+"""Number of bins over a joint's range of theta."""
 KINDS: Final = {kind_of(module): 2 * i for i, module in enumerate(MODULES[: N_LEG // 2])}
 """Index of a kind's phi in a leg."""
 
@@ -127,10 +127,9 @@ class Poses:
 
 
 class BoundsOverPoses:
-    """Collects the bounds while the schedule is computed; both legs have the same."""
+    """Collects the command bounds, equal for both legs, while the schedule is computed."""
 
     def __init__(self, config: RobotConfig) -> None:
-        """Start with the stand gains only."""
         right = MODULES[: N_LEG // 2]
         self._stand_k_p = np.ravel([config.stand_gains(module).k_p for module in right])
         self._k_p: list[Array] = []
@@ -140,7 +139,7 @@ class BoundsOverPoses:
         self._v_ref: list[Array] = []
 
     def add(self, poses: Poses, node: PoseNode, D: Array) -> None:
-        """Add the last of the poses, a node, with its local stiffness (6,), N m/rad."""
+        """Add a node, the pose last solved by `poses`, with its local stiffness D (6,), N m/rad."""
         q, kinematics = poses.q, poses.kinematics
         self._k_p.append(D)
         self._k_p_max.append(node.D_max)

@@ -4,18 +4,19 @@ The stiffness certificate (`services.planner.law.certificate`) is linear and has
 module adds them, for a constant horizontal push F u at the torso's origin:
 
 1. Limit of the gains. The local gains D hold with constant references; while the planner is
-   engaged, K_c acts too (`services.planner.law.coupling`). The body moves by dp, torques change:
+   engaged, K_c acts too (`services.planner.law.coupling`). Body and torques change by dp, dtau:
 
        (K_fail + K_c) dp = F pi,   pi = (dr_torso/dp)^T u,   dtau = -D T dp - J^T K_c dp
 
-   While led, a slowly growing push leaves no error along y up to `law.push_integral_max`.
+   While led, a slowly growing push of up to `law.push_integral_max` leaves no error along y.
 
 2. Limit of the body, under any control, at fixed joint angles. A linear program chooses how the
    two legs share weight and push. No gains withstand a larger push at that pose.
 
 Leg i carries the torso wrench W_i: tau_i = J_i^T W_i + the torque of its knee's weight. Its sole
-carries W_i moved to the ankle, plus the leg's weight. J_i^T dW_i = dtau_i - (H T dp)_i. Every limit
-is linear in tau and in the soles' wrenches, so the first limit that is reached sets the force.
+carries W_i moved to the ankle, plus the leg's weight. A push changes W_i by dW_i, with
+J_i^T dW_i = dtau_i - (H T dp)_i. Every limit is linear in tau and in the soles' wrenches, so the
+first limit that is reached sets the force.
 """
 
 from __future__ import annotations
@@ -64,9 +65,9 @@ class PushLimits(NamedTuple):
     led: _PushLimit
     """TRACK: joint services and planner; the push grows slowly."""
     held: _PushLimit
-    """HOLD: joint services only, the planner is dead."""
+    """HOLD: joint services only; the planner is dead."""
     drives: _PushLimit
-    """Drives only, the joint services are dead too."""
+    """Drives only; the joint services are dead too."""
     body: _PushLimit
     """Limit of soles and motors under any control."""
 
@@ -123,8 +124,7 @@ class LoadedStand:
         ankles = ankle_positions(config) + np.outer((0.5, -0.5), kinematics.stance[:3])
         self._arms = [kinematics.r_torso - ankle for ankle in ankles]
         self._leg_weights = [
-            # the knee's weight turns the ankle with a moment equal to the ankle's torques
-            # from it
+            # the moment of the knee's weight at the ankle equals the ankle torques that carry it
             np.array([0.0, 0.0, config.leg_weight, *self._tau_knees[leg][:2], 0.0])
             for leg in _LEGS
         ]
@@ -142,7 +142,7 @@ class LoadedStand:
     def response(
         self, D: Array, direction: tuple[float, float], K_c: Array | None = None
     ) -> Response | None:
-        """Return the response to a constant push of 1 N, or None if the gains cannot stand.
+        """Return the response to a constant push of 1 N, or None if the robot cannot stand.
 
         Args:
             D: local stiffnesses (12,), N m/rad. With drivetrain stiffness k, pass D k / (D + k).
@@ -199,7 +199,7 @@ class LoadedStand:
         return beyond._replace(force_n=until_n + beyond.force_n)
 
     def _hardest(self, response: Response | None, borne: Array) -> _PushLimit:
-        """Return the largest push in addition to the present load of torques and soles (24,)."""
+        """Return the largest push that torques and soles carry beside the load `borne` (24,)."""
         if response is None:
             return _PushLimit(0.0, "the stiffness")
         before = borne + np.concatenate((self._tau, self._soles(self._W)))

@@ -1,6 +1,6 @@
 """Models the sampled-data loop around a pose: linear, with a flexible drivetrain. Offline and pure.
 
-The dynamic certificate (docs/law.md) rests on this model. Around a standing pose, in deviations
+The dynamic certificate (docs/law.md) uses this model. Around a standing pose, in deviations
 from it, with both feet in place:
 
     M p''     = T^T s - (K_geo + K_hand) p - (B_hand + d_joint T^T T) p'
@@ -12,8 +12,8 @@ The controllers run on it, each at its own rate:
 
     drive          u = W - D_m q^ - D_Bm v^                     D_m: the module's mean
     joint service  W = tau + D_m q^ + D_Bm v^, tau the law of `services.joint.pd_law` on q^, v^
-    planner        r = S J q^, q_ref = T r, tau_coupled filtered, sent d later than sampled;
-                   F_I' = K_p e_y / push_integral_s is part of tau_coupled
+    planner        r = S J q^, q_ref = T r, tau_coupled filtered, used d after the sample;
+                   tau_coupled includes F_I, with F_I' = K_p e_y / push_integral_s
 
 One planner period is a linear map. The loop is stable if the map's spectral radius is below 1.
 
@@ -110,7 +110,7 @@ class Feedback(NamedTuple):
     seen: Array = np.eye(N_JOINTS)
     """(12, 12): the local loops measure `seen` q; the identity unless an encoder is blind."""
     lifts: float = 0.0
-    """N/s per metre: rate at which a parked robot's assist rises below its height. Above 0 the
+    """Rate at which a parked robot's assist rises per metre below its height, N/(s m). Above 0 the
     assist also follows the hand's force, and nothing is eased (`services.planner.watch.park`)."""
 
 
@@ -235,7 +235,7 @@ class SampledLoop:
 
     Attributes:
         A: matrix of plant and estimator, x' = A x + B (u, f).
-        n_z: (n_p,), rise of the harness point along p.
+        n_z: (n_p,), rise of the harness point per unit of p.
         feedback: feedback of services and planner, before the projection to the half.
     """
 
@@ -332,11 +332,11 @@ class SampledLoop:
         return out[:, :width], out[:, width:]
 
     def eigenvalues(self, gains: Gains = NOMINAL) -> NDArray[np.complex128]:
-        """Return the eigenvalues of one planner period; stable if inside the unit circle."""
+        """Return the eigenvalues of one planner period; stable if every magnitude is below 1."""
         return np.asarray(np.linalg.eigvals(self.period_map(gains)[0]), complex)
 
     def growth(self, gains: Gains = NOMINAL, above_hz: float = 0.0) -> Growth:
-        """Return the growth of the slowest decay, ignoring motions slower than `above_hz`."""
+        """Return the motion that decays most slowly, ignoring motions slower than `above_hz`."""
         period = self._timing.planner_period
         values = self.eigenvalues(gains)
         if above_hz > 0.0:

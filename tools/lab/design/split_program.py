@@ -13,13 +13,14 @@ and with the full assist. K_geo is linear in the assist, so every assist in betw
 
 Damping and coupling are chosen with the dynamic certificate, one set for all nodes:
 
-    minimise    effort of the hand in a squat [N] + SWAY_WEIGHT (slowest decay + DECAY_WANTED)+
-    subject to  every condition of `tools.lab.design.dynamic_certificate` decays
+    minimise    effort of the hand in a squat [N] + SWAY_WEIGHT (rate of sway + DECAY_WANTED)+
+    subject to  every condition of `tools.lab.design.dynamic_certificate`
 
-The variables are the six local dampings of a leg, and bandwidth and damping of tau_coupled, all on
-a ladder of ratios. The method is coordinate descent from a stable start. Each step evaluates the
-certificate at a few poses and drivetrains; the final check covers all of them. A pose that fails
-the check is added to the few.
+The rate of sway, 1/s, is negative if the sway decays. The variables are the six local dampings of
+a leg, and bandwidth and damping of tau_coupled, all on a ladder of ratios. The method is coordinate
+descent from a stable start. Each step evaluates the certificate at a few poses and drivetrains; the
+final check covers all of them. A pose that fails this check is added to the few, and the descent
+starts again.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ else:
 Progress = Callable[[int, int], None]
 """Called with the number of nodes that are done, and their total."""
 Report = Callable[[str], None]
-"""Called with text about the search for damping."""
+"""Called with progress messages of the search for damping."""
 
 N_HEIGHTS: Final = 25
 DYNAMIC_HEIGHTS: Final = 13
@@ -94,11 +95,11 @@ def solve(
 ) -> GainSchedule:
     """Return the schedule of a robot.
 
-    A given design is used, and with `check` checked against the dynamic certificate. Without a
-    design the function searches for one.
+    If a design is given, it is used; `check` decides whether it must first meet the dynamic
+    certificate. Otherwise the function searches for one.
 
     Raises:
-        RunError: no local gains meet the certificate at a pose; names the pose.
+        RunError: no gains meet a certificate; names the pose or the condition.
     """
     poses = Poses(config)
     z_nodes = np.linspace(*poses.reach(), N_HEIGHTS)
@@ -206,7 +207,10 @@ def _program(config: RobotConfig, node: PoseNode, z: float, pitch: float) -> Arr
             warnings.simplefilter("ignore", UserWarning)
             problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as error:
-        raise RunError(f"{where}: the solver failed: {error}") from None
+        raise RunError(
+            f"{where}: the solver failed: {error}; "
+            "check the values of [certificate] and [law] in the robot file"
+        ) from None
     if problem.status == cp.settings.USER_LIMIT:  # there are values, but not a solution
         raise RunError(
             f"{where}: the solver stopped at its iteration limit; "
@@ -276,13 +280,14 @@ def check_design(
     """Check a design against the certificate.
 
     Raises:
-        RunError: it is not stable; names the condition.
+        RunError: the design is not stable; names the condition.
     """
     report("checking every pose and drivetrain")
     verdict = DynamicCertificate(config, nodes).worst(design)
     if not verdict.stable:
         raise RunError(
-            f"the given damping is not stable: {verdict.words()}; run `xrl gains` without a damping"
+            f"the given damping is not stable: {verdict.words()}; "
+            "run `xrl gains` without --damping-of"
         )
 
 

@@ -1,6 +1,6 @@
 """Breaks down one planner tick into gains, margins, and each joint's torque by origin. Pure.
 
-`LawAtReference` is the function that the planner's tick runs. Here its inputs come from the log:
+It runs the law of the planner's tick (`LawAtReference`). Here the law's inputs come from the log:
 the joints, the references and the assist (docs/law.md).
 """
 
@@ -57,7 +57,7 @@ class TorqueBreakdown(NamedTuple):
     """Torque that the planner adds, before its low-pass."""
     filtered: Array
     """Change of the coupled torque by its low-pass, plus the integral F_I and the easing of the
-    operator's lead. Not computed here, because the log does not contain their states."""
+    operator's lead. Zero here: `xrl log explain` computes it from the recorded commands."""
 
     @property
     def total(self) -> Array:

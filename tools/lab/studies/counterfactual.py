@@ -1,4 +1,4 @@
-"""Counterfactuals of a recorded run: the outcome if something had died at one of its moments."""
+"""Counterfactuals of a recorded run: the outcome if services had died at some moment."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ R = TypeVar("R")
 T = TypeVar("T")
 
 EARLY_S: Final = 0.5 / topics.SIM_STATE.rate_hz
-"""A state this long before a moment still counts as the nearest one, s."""
+"""Maximum time by which a state may precede its due moment, s."""
 NEAR_NS: Final = 12 * NS_PER_MS
-"""A service whose last cycle is older than this at a moment counts as dead."""
+"""A service counts as dead at a moment if its last cycle is older than this."""
 KILL_AFTER_S: Final = 1e-3
 STOOD, FELL = "#2e7d32", "#c0392b"
 
@@ -60,7 +60,7 @@ class Moment(msgspec.Struct):
         return self.state.scenario_s
 
     def runs(self, services: Sequence[str]) -> bool:
-        """Return True if at least one of some services (planner, modules) runs at this moment."""
+        """Return True if at least one of these services (planner, modules) runs at this moment."""
         return any(
             self.planner is not None if name == "planner" else name in self.modules
             for name in services
@@ -70,8 +70,8 @@ class Moment(msgspec.Struct):
 def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
     """Return the moments of a run's scenario, at a given interval.
 
-    Joint services and planner are executed again from the log up to each moment, so their states
-    are exact to the last bit.
+    Joint services and planner are re-executed from the log, so their states are exact to the last
+    bit.
 
     Raises:
         RunError: the run contains no states of the simulated world.
@@ -85,8 +85,8 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
             due_s = every_s * (1 + math.floor((state.scenario_s + EARLY_S) / every_s))
     if not found:
         raise RunError(
-            f"{log.path}: no state of the simulated world (sim/state) in it; a run of this version "
-            "whose scenario has started has one every 0.1 s, but a real robot's run lacks them"
+            f"{log.path}: contains no states of the simulated world (sim/state). Simulated runs of "
+            "this version contain one every 0.1 s of the scenario; a real robot's runs contain none"
         )
     for name in MODULES:
         joint = JointExecution(robot, name, ReexecutionResult(name, 0.0, exact=False))
@@ -138,7 +138,7 @@ class Task(msgspec.Struct, frozen=True):
     for_s: float
     """Duration of the continued run, s."""
     hand: tuple[HandRow, ...] = ()
-    """Recorded motion of a hand that a person led, if any."""
+    """Recorded motion of the simulated hand, if a person led it."""
 
 
 class Counterfactual(msgspec.Struct, frozen=True):
@@ -149,7 +149,7 @@ class Counterfactual(msgspec.Struct, frozen=True):
     stood: bool
     fell_after_s: float | None
     com_x_max_mm: float
-    """Largest distance from midway between the ankles while standing, mm."""
+    """Largest distance of the COM from midway between the ankles while standing, mm."""
     com_y_max_mm: float
     sole_tilt_max_rad: float
     margin: float | None
@@ -212,11 +212,11 @@ def draw(
         colour = STOOD if one.stood else FELL
         ended.axvspan(one.at_s, one.at_s + every_s, color=colour, lw=0)
     ended.set_yticks([])
-    ended.set_ylabel("killed then", fontsize=8, rotation=0, ha="right", va="center")
+    ended.set_ylabel("outcome", fontsize=8, rotation=0, ha="right", va="center")
     at = np.array([one.at_s for one in counterfactuals])
     com.plot(at, [one.com_x_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="x")
     com.plot(at, [one.com_y_max_mm for one in counterfactuals], ".-", ms=4, lw=0.8, label="y")
-    com.set_ylabel("then COM at most, mm", fontsize=8)
+    com.set_ylabel("largest COM, mm", fontsize=8)
     com.legend(loc="upper right", fontsize=8, ncols=2)
     known = [(one.at_s, one.margin) for one in counterfactuals if one.margin is not None]
     if known:

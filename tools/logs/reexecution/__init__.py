@@ -1,1 +1,1 @@
-"""Re-execution of a run's services from its log, with the very same objects."""
+"""Re-execution of a run's services from its log, with the services' own objects."""

@@ -32,7 +32,7 @@ class _Difference(msgspec.Struct, frozen=True):
     t_ns: int
     """Time on the service's clock."""
     tick: int
-    """Its cycle, or its tick."""
+    """Cycle of a joint service, or tick of the planner."""
     key: str
     """Topic below `xrl/<robot>/`."""
     field: str
@@ -108,11 +108,11 @@ class ReexecutionResult:
 
     Attributes:
         service: its name.
-        exact: True if the snapshots are compared too; False where a parameter was changed.
+        exact: True if the snapshots are compared too; False if parameters or the law were changed.
         ticks: number of executed cycles or ticks.
-        skipped: number of others: before the first snapshot in the log, or after a loss.
+        skipped: number of cycles or ticks before the first snapshot in the log, or after a loss.
         starts: number of starts from a recorded snapshot.
-        lost_inputs: messages that the service used and the log lacks.
+        lost_inputs: number of messages that the service used and the log lacks.
         comparison: comparison of the outputs.
     """
 
@@ -150,18 +150,18 @@ class ReexecutionResult:
 
 
 def memory_of(text: str, kind: type[State]) -> State:
-    """Return a recorded snapshot."""
+    """Decode a recorded snapshot."""
     try:
         return msgspec.json.decode(text, type=kind)
     except (msgspec.DecodeError, RecursionError) as error:
         raise RunError(
-            f"a service's snapshot in the log is not a {kind.__name__}: {error}; execute it with "
-            "the checkout that wrote it (`xrl log info` shows its commit)"
+            f"a service's snapshot in the log is not a {kind.__name__}: {error}; use the checkout "
+            "that wrote the log (`xrl log info` shows its commit)"
         ) from None
 
 
 def size(row: _Difference) -> float:
-    """Return the distance of the two values, infinite if they are not numbers."""
+    """Return the distance between the two values, infinite if they are not numbers."""
     a, b = row.recorded, row.recomputed
     return abs(b - a) if _is_number(a) and _is_number(b) else math.inf
 
@@ -172,7 +172,7 @@ def _short(value: Any) -> str:
 
 
 def ulp(a: Any, b: Any) -> int | None:
-    """Return the number of floats between a and b, or None if one is not a float."""
+    """Return how many floats apart a and b are, or None if one is not a float."""
     if not (isinstance(a, float) and isinstance(b, float)):
         return None
     return abs(_ordered(a) - _ordered(b))
@@ -225,7 +225,7 @@ BLAS_VARIABLES: Final = ("OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE")
 
 
 def likely_reason(recorded: Origin, here: Origin) -> str:
-    """Return one line with the differences of a log's origin from this one, and unknown facts."""
+    """Return one line with the differences between two origins, and the unknown facts."""
     differing, untold = [], []
     for (name, one), (_, other) in zip(_facts(recorded), _facts(here), strict=True):
         if UNKNOWN in (one, other) or (one == other and one.endswith(CHANGED)):
@@ -233,7 +233,7 @@ def likely_reason(recorded: Origin, here: Origin) -> str:
         elif one != other:
             differing.append(f"{name} {one}, here {other}")
     if differing:
-        line = f"likely reason, recorded with {'; '.join(differing)}"
+        line = f"likely reason: recorded with {'; '.join(differing)}"
     else:
         line = "no reason known: it was recorded with the same environment as here"
     return f"{line} (unknown: {', '.join(untold)})" if untold else line

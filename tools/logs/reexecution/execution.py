@@ -1,8 +1,8 @@
 """Re-execution of a run's services, in ranges of time that can be executed in parallel.
 
 Execution of each range begins slightly early, at a recorded snapshot of the services. The part
-before the range is not counted. So every tick is executed once, from a snapshot that the previous
-range is compared with.
+before the range is not counted. So every tick counts once. The snapshot from which a range starts
+is also compared with the result of the previous range.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def execution_of(
     exact: bool = True,
     controller: Callable[[], Controller] | None = None,
 ) -> Execution:
-    """Return an executor for a service with a robot, the planner's with an optional controller."""
+    """Return the executor of a service; `controller` replaces the planner's law."""
     outcome = ReexecutionResult(name, tolerance, exact=exact)
     if name == "planner":
         return PlannerExecution(robot, outcome, controller)
@@ -42,7 +42,7 @@ def execution_of(
 RANGE_S: Final = 60.0
 """Length of a range, s; shorter ranges spend more time on their lead-in and on starting."""
 LEAD_S: Final = 2.5
-"""Lead-in, s: snapshots are a second apart."""
+"""Lead-in before a range, s; snapshots are a second apart."""
 
 
 class RangeTask(NamedTuple):

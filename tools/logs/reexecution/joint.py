@@ -1,4 +1,4 @@
-"""Re-execution of a joint service, cycle by cycle: its own loop, with inputs from the log."""
+"""Re-execution of a joint service, cycle by cycle: the service's loop with inputs from the log."""
 
 from __future__ import annotations
 
@@ -91,10 +91,10 @@ class _Stops:
 
 
 class JointExecution:
-    """One module's service, from its traces."""
+    """The re-executed joint service of one module, from its recorded traces."""
 
     def __init__(self, robot: RobotConfig, name: str, outcome: ReexecutionResult) -> None:
-        """Use a robot and a module's name; fill in `outcome`."""
+        """Prepare to execute the module `name` of a robot; `run` fills in `outcome`."""
         self._robot, self._name, self.outcome = robot, name, outcome
         self._cycle = _Cycle()
         self._loop: JointLoop | None = None
@@ -124,7 +124,6 @@ class JointExecution:
                     yield from self._execute(self._loop, cycle)
 
     def _load(self, log: RunLog) -> None:
-        """Look up the inputs and outputs of the cycles of a part."""
         name, self._log_robot = self._name, log.robot
         commands: list[JointCommand] = log.messages(topics.JOINT_COMMAND, name)
         self._commands = {(command.session, command.seq): command for command in commands}
@@ -216,7 +215,7 @@ def _reading(c: CycleTrace) -> DriveReading | None:
     if status is None:
         raise RunError(
             f"trace of the cycle at {c.now_ns} ns: drive status {c.status}, but the maximum is "
-            f"{max(_STATUS)}: the record is damaged"
+            f"{max(_STATUS)}; the record is damaged"
         )
     return DriveReading(
         c.sampled_ns,

@@ -15,13 +15,13 @@ from shared.config.robot_config import RobotConfig
 from shared.exceptions import ConfigError
 
 DIRECTIONS: Final = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Names of the six rows of K_p and B_p."""
+"""Names of the six values of K_p and B_p."""
 
 
 def with_params(robot: RobotConfig, texts: Sequence[str], file: str) -> RobotConfig:
-    """Return a robot with keys of its file changed.
+    """Return a robot with values of its file changed.
 
-    A text is NAME=VALUE. NAME is a dotted key as in the robot file, with an index or a direction
+    Each text is NAME=VALUE. NAME is a dotted key as in the robot file, with an index or a direction
     for one value of a row: law.K_p.x=2000, joint_service.blend_ms=100. The gain schedule remains
     as recorded, and is treated as made for the changed robot.
     """

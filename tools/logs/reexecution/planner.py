@@ -1,4 +1,4 @@
-"""Re-execution of the planner, tick by tick: its own loop, with inputs from the log."""
+"""Re-execution of the planner, tick by tick: the planner's loop with inputs from the log."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _encode: Final = msgspec.json.Encoder().encode
 
 
 class _BySeq(Generic[M]):
-    """Finds a sender's message by its number; a restarted sender restarts its count."""
+    """Finds a sender's message by its sequence number, which restarts with the sender."""
 
     def __init__(self, messages: Iterable[M]) -> None:
         self._rows: dict[int, list[M]] = {}
@@ -42,7 +42,7 @@ class _BySeq(Generic[M]):
 
 
 class _LoggedInbox(Generic[M]):
-    """An inbox with the message that was used in this tick, from the log."""
+    """An inbox with the logged message that was used in this tick."""
 
     def __init__(self) -> None:
         self.message: M | None = None
@@ -53,7 +53,7 @@ class _LoggedInbox(Generic[M]):
 
 
 class _KeptOutbox(Generic[M]):
-    """An outbox that keeps the outputs of this tick."""
+    """An outbox that stores the outputs of this tick."""
 
     def __init__(self) -> None:
         self.messages: list[M] = []
@@ -93,7 +93,7 @@ class PlannerExecution:
         outcome: ReexecutionResult,
         controller: Callable[[], Controller] | None = None,
     ) -> None:
-        """Use a robot and, if given, the user's own controller; fill in `outcome`."""
+        """Prepare to execute a planner with its law or `controller`; `run` fills in `outcome`."""
         self._robot, self.outcome, self._controller = robot, outcome, controller
         self._tick = _Tick()
         self._loop: PlannerLoop | None = None
@@ -118,7 +118,6 @@ class PlannerExecution:
             yield from self._execute(self._loop, status)
 
     def _load(self, log: RunLog) -> None:
-        """Look up the inputs and outputs of the ticks of a part."""
         self._log_robot = log.robot
         snapshots: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
         self._snapshots = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in snapshots}
@@ -156,7 +155,7 @@ class PlannerExecution:
         self.outcome.starts += 1
 
     def _receive(self, planner: Planner, status: PlannerStatus) -> bool:
-        """Pass the planner the inputs of this tick; return False if the log lacks one."""
+        """Pass the inputs of this tick to the planner; return False if the log lacks an input."""
         tick, (state_seq, wrench_seq, attitude_seq) = self._tick, self._taken
         given = True
         for module, (seq, age_ns) in enumerate(

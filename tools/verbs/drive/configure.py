@@ -49,8 +49,7 @@ from tools.terminal import Console, marked
 BACKUPS: Final = Path("out") / "drive-backups"
 
 EXAMPLES: Final = """
-xrl drive configure                          # show the differences, write nothing
-xrl drive configure --apply
+xrl drive configure
 xrl drive configure --apply --module knee_left
 xrl drive configure --apply --calibrate --module knee_left     # a new board; its leg hangs
 xrl drive configure --restore out/drive-backups/20260301-101500.json --apply
@@ -71,18 +70,18 @@ class ConfigureFlags(FleetRobotFlags):
     apply: Annotated[bool, Arg(exclusive="what")] = False
     """write and save the settings; the boards restart"""
     module: tuple[Module, ...] = ()
-    """only this module; may be given several times (default: all six)"""
+    """only this module; repeatable (default: all six, or with --restore those in the backup)"""
     restore: Annotated[Path | None, Arg(metavar="BACKUP.json")] = None
     """write a backup's settings instead of the robot file's"""
     out: Folder = BACKUPS
     """folder for the backup"""
     calibrate: bool = False
-    """then calibrate the uncalibrated axes, whose leg must hang: each motor turns by about a turn
-    and back, and the drive loses its zero"""
+    """with --apply: then calibrate the uncalibrated axes; each motor moves about a turn and back,
+    so the leg must hang; the drive loses its zero"""
     again: bool = False
-    """with --calibrate: also calibrate axes that are already calibrated"""
+    """with --calibrate: also recalibrate calibrated axes"""
     yes: bool = False
-    """with --calibrate: do not ask for confirmation"""
+    """do not ask for confirmation"""
 
     def check(self) -> None:
         """Refuse flags that need --calibrate or contradict it."""
@@ -90,7 +89,7 @@ class ConfigureFlags(FleetRobotFlags):
         if (self.again or self.yes) and not self.calibrate:
             raise DriveError("--again and --yes need --calibrate")
         if self.calibrate and self.restore:
-            raise DriveError("--calibrate measures what a backup cannot hold; remove --restore")
+            raise DriveError("--calibrate and --restore cannot be combined; remove --restore")
 
 
 def run(flags: ConfigureFlags) -> int:
@@ -158,14 +157,14 @@ def _write(
         calibration.refuse_standing(robot, flags.run_dir, found, axes)
     kept = keep(flags.out, boards, path)
     restore = f"`xrl drive configure --restore {shlex.quote(str(kept))}`"
-    console.print(f"\nbackup of the boards: {kept}; {restore} shows it")
+    console.print(f"\nbackup of the boards: {kept}; {restore} shows its differences")
     with interrupts.kept():
         outcomes = apply(console, boards, difference, interrupts)
     code = _conclude(console, robot, outcomes) if difference else 0
     if interrupts.number:
         begun = {outcome.change.module for outcome in outcomes}
         rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
-        console.print(f"stopped before {', '.join(rest)}" if rest else "nothing was left to do")
+        console.print(f"stopped before {', '.join(rest)}" if rest else "stopped after the last one")
         exit_if_interrupted(interrupts)
     if code or not axes:
         return code
@@ -176,7 +175,7 @@ def _write(
 
 
 def modules_of(flags: ConfigureFlags, robot: RobotConfig, saved: Backup | None) -> tuple[str, ...]:
-    """Return the given modules, by default those of the backup, or else all.
+    """Return the given modules; by default those of the backup, or all without a backup.
 
     Raises:
         DriveError: the backup lacks a module, or is from another board than the robot file's.
@@ -187,13 +186,14 @@ def modules_of(flags: ConfigureFlags, robot: RobotConfig, saved: Backup | None) 
     modules = tuple(flags.module or by_module)
     for module in modules:
         if module not in by_module:
-            raise DriveError(f"{flags.restore}: has no {module}, only {', '.join(by_module)}")
+            there = ", ".join(by_module)
+            raise DriveError(f"{flags.restore}: no backup of {module} in it, only of {there}")
         serial = robot.module_named(module).serial_number.upper() if module in MODULES else ""
         other = by_module[module].serial_number.upper()
         if serial != other:
             raise DriveError(
-                f"{flags.restore}: {module} is ODrive {other}, but {serial or 'unnamed'} in the "
-                "robot file; a backup can only be restored to the board it came from"
+                f"{flags.restore}: {module} is ODrive {other}, but {serial or 'no serial_number'} "
+                "in the robot file; a backup can only be restored to the board it came from"
             )
     return modules
 
@@ -219,13 +219,13 @@ def boards_of(robot: RobotConfig, modules: Sequence[str], found: FoundBoards) ->
         if board is None:
             raise DriveError(
                 f"{module}: {serial or 'no serial_number in its [[module]]'}: "
-                f"{found.troubles.get(serial, 'not known')}{found.in_no_module(robot)}. "
+                f"{found.troubles.get(serial, 'its board is unknown')}{found.in_no_module(robot)}. "
                 "Settings are written over USB; `xrl doctor` says what is missing"
             )
         if not is_known(board.firmware):
             raise DriveError(
                 f"{module}: firmware {describe_firmware(board.firmware)} is not supported; the "
-                f"settings are for {describe_firmware(FIRMWARE)}. Flash that first"
+                f"settings are for {describe_firmware(FIRMWARE)}. Flash that version first"
             )
         boards[module] = board
     return boards
@@ -237,9 +237,9 @@ def differences(
     saved: Backup | None,
     axes: Mapping[str, Sequence[str]] | None = None,
 ) -> list[SettingChange]:
-    """Return all settings to change, by module, except the marks of axes to be calibrated.
+    """Return all settings to change, by module, except the calibration marks of axes to calibrate.
 
-    A backup must be from the same firmware: settings may mean something else in another.
+    A backup must be from the same firmware: a setting may mean something else in another one.
     """
     rows: list[SettingChange] = []
     kept = {board.module: board for board in saved.boards} if saved else {}
@@ -278,7 +278,7 @@ def apply(
     difference: Sequence[SettingChange],
     interrupts: Interrupts,
 ) -> list[ChangeResult]:
-    """Write, save and read back each board in turn; a failed board does not stop the others.
+    """Write, save and read back one board's settings after another's; continue after a failure.
 
     A board is finished before an interrupt takes effect: otherwise half of its settings would be
     active and none saved.

@@ -39,16 +39,16 @@ STYLES: Final = {"change": "bold yellow", "agrees": "green", "measured": "", "no
 
 
 class IdentifyFlags(MotionFlags):
-    """Joints to measure, and the torque that moves them."""
+    """Joints to measure, and their torque limit."""
 
     module: Annotated[tuple[str, ...], positional("MODULE", one_of="which")] = ()
-    """modules to measure; or give --all"""
+    """module, such as knee_left"""
     all: Annotated[bool, Arg(one_of="which")] = False
-    """all six modules, one joint after the other"""
+    """all six modules"""
     axis: Annotated[str | None, Arg(choices=AXES)] = None
     """only this axis (default: both)"""
     torque: Annotated[float, Range(1e-3, FINITE_MAX, "N m")] = 15.0
-    """torque amplitude of the sine motions; a bent leg's static load is added"""
+    """torque limit, added to the torque against gravity; the sine motions scale with it"""
 
     def check(self) -> None:
         """Refuse unknown modules."""
@@ -69,7 +69,7 @@ class IdentifyFlags(MotionFlags):
 
 
 def run(flags: IdentifyFlags) -> int:
-    """Measure the requested joints; 0 if no motion was stopped."""
+    """Measure the requested joints; return 0 if no motion was stopped."""
     console = Console()
     path = robot_file(flags)
     robot = config_file.load_without_schedule(path)

@@ -48,7 +48,7 @@ xrl drive jog knee_left --torque-limit 30     # if its load needs more
 TRAVEL_SHARE: Final = 0.25
 """Maximum error of the travel, as a fraction of the requested travel."""
 LAG_MAX: Final = 0.02
-"""Maximum lag behind the reference, beyond the deflection by the load at rest, rad."""
+"""Maximum lag behind the reference, rad, without the deflection by the load at rest."""
 SIBLING_MAX: Final = 0.02
 """Maximum motion of the other axis, rad."""
 
@@ -57,21 +57,23 @@ class JogFlags(MotionFlags):
     """Joint to move, and its motion."""
 
     module: Annotated[str, positional("MODULE", choices=MODULES)]
-    """module to move"""
+    """module, such as knee_left"""
     axis: Annotated[str, Arg(choices=AXES)] = "theta"
+    """axis to move"""
     by: Annotated[float, Range(-BY_MAX, BY_MAX, "rad")] = BY
-    """distance out and back; positive theta leans forward"""
+    """distance out and back; positive theta leans the part above forward"""
     period: Annotated[float, Range(PERIOD_MIN_S, 60.0, "s")] = PERIOD_S
     """time of one motion out and back"""
     cycles: Annotated[int, Range(1, CYCLES_MAX, "")] = CYCLES
+    """number of motions"""
     torque_limit: Annotated[Number, Arg(metavar="NM")] = TORQUE_LIMIT
-    """torque limit of both axes together at the joint, set as the drive's own current limit"""
+    """torque limit at the joint, both axes together, set as the drive's current limit"""
 
     def check(self) -> None:
         """Refuse a motion of zero."""
         super().check()
         if self.by == 0.0:
-            raise DriveError(f"--by 0: must not be 0; give up to {BY_MAX:g} rad either way")
+            raise DriveError(f"--by 0: moves nothing; give up to {BY_MAX:g} rad either way")
 
     @property
     def plan(self) -> JogPlan:
@@ -81,7 +83,7 @@ class JogFlags(MotionFlags):
 
 
 def run(flags: JogFlags) -> int:
-    """Check the joint, ask, move it, idle the drive and judge the motion."""
+    """Check the joint, ask the person, move the joint, idle the drive and judge the motion."""
     console = Console()
     plan = flags.plan
     path = drive_access.robot_file(flags)
@@ -188,7 +190,7 @@ def what_to_see(module: str, axis: int, by: float) -> str:
     """Return a description of the correct motion, for a person who watches.
 
     A positive angle leans the part above the joint forward (theta) or to the right (phi)
-    against the part below; below a hanging torso, the lower part swings the same way.
+    relative to the part below; if the torso hangs, the part below swings that way instead.
     """
     kind, positive = kind_of(module), by > 0.0
     upper = {"ankle": "shin", "knee": "thigh", "hip": "torso"}[kind]
@@ -232,9 +234,9 @@ def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
 
 
 def friction(moving: list[Sample], plan: JogPlan) -> float:
-    """Return half the difference of torque between the way there and the way back, N m.
+    """Return half the difference of the mean torques on the way there and on the way back, N m.
 
-    Uses only the fast part of the motion; gravity and springs are equal on both ways and cancel.
+    Uses only the fast part of the motion; the torques of gravity and springs cancel.
     """
     omega = 2.0 * math.pi / plan.course.period_s
     sign = math.copysign(1.0, plan.course.by)

@@ -18,16 +18,15 @@ from tools.fleet.supervise import SupervisedFleet
 from tools.terminal import Console
 
 LOADED_N: Final = 30.0
-"""Above this reading the harness is assumed to be loaded, because drift is smaller, N."""
+"""Reading above which the harness is assumed to be loaded, N; drift is smaller."""
 REPEAT_S: Final = 0.02
-"""Period of the request until the tare has started, s: the bus may drop a message."""
+"""Period at which the request is repeated until the tare starts, s: the bus may drop messages."""
 HEARD_S: Final = 3.0
 """Timeout for the first wrench, s."""
 GIVE_UP_S: Final = 10.0
 
 EXAMPLES: Final = """
 xrl drive tare
-xrl drive tare --anyway
 """
 
 
@@ -36,7 +35,7 @@ class TareFlags(RunDirFlags):
 
     anyway: Annotated[
         bool,
-        Arg(help=f"tare even if the harness reads more than {LOADED_N:g} N, if its sensor drifted"),
+        Arg(help=f"tare a drifted sensor that reads more than {LOADED_N:g} N"),
     ] = False
 
 

@@ -46,7 +46,7 @@ from tools.terminal import Console, marked
 HEIGHT_TOLERANCE: Final = 1e-7
 """Tolerance of the torso's height, m."""
 ROUNDS: Final = 20
-"""Maximum rounds of the search for the COM height of a torso height; three are usual."""
+"""Maximum rounds of the search for the COM height at a torso height; three are usual."""
 DEGREES_FROM: Final = 7.0
 """Angles above this, rad, are more than a turn and are assumed to be in degrees."""
 
@@ -54,12 +54,11 @@ HEARD_S: Final = 2.0
 """Timeout for the states of joint services that are up, s."""
 
 EXAMPLES: Final = """
-xrl drive zero knee_left --at 0,-0.5          # measured with a protractor: phi, theta in rad
-xrl drive zero ankle_right --at -0.02,0.14
-xrl drive zero --all --standing 1.188         # in the jig: soles flat, hips 1.188 m above ankles
-xrl drive zero --all --resume                 # hanging, after a loss of power: unmoved joints
+xrl drive zero knee_left --at 0,-0.5          # phi and theta by protractor, rad
+xrl drive zero --all --standing 1.188         # in the jig
+xrl drive zero --all --resume                 # joints that have not moved
 xrl drive zero --all --resume --untouched --swing --level     # knees and hips that have moved
-xrl drive zero ankle_left --resume --untouched --at 0.1,0.3   # measured to 0.08 rad
+xrl drive zero ankle_left --resume --untouched --at 0.1,0.3   # rough angles
 """
 
 _PAIR: Final = numbers(2, "phi and theta in rad, such as 0,-0.5")
@@ -69,31 +68,29 @@ class ZeroFlags(FleetRobotFlags):
     """Modules to zero, and the angles of their joints."""
 
     module: Annotated[str | None, positional("MODULE", choices=MODULES, one_of="which")] = None
-    """module to zero"""
+    """module, such as knee_left"""
     all: Annotated[bool, Arg(one_of="which")] = False
     """all six modules"""
     at: Annotated[Pair | None, parsed(_PAIR, "PHI,THETA", exclusive="where")] = None
     """present angles of the joint, rad, such as 0,-0.5"""
     standing: Annotated[Number | None, Arg(metavar="HEIGHT", exclusive="where")] = None
-    """the robot stands, or hangs in the same pose: both soles flat and level, geometry.w_base
-    apart, torso upright, COM over the ankles, the hips' axis HEIGHT m above the ankles'; the angles
-    follow from the lengths in the robot file"""
+    """the robot stands, or hangs in the same pose: soles flat, level and geometry.w_base apart,
+    torso upright, COM over the ankles, the hip axis HEIGHT m above the ankle axis; the robot file's
+    lengths give the angles"""
     resume: bool = False
-    """after a loss of power, while the robot hangs: find the whole turns from the stored zero, and
-    report how clear the result is; unclear results are refused. With this flag, --at and --standing
-    may be rough, within 0.08 rad"""
+    """after a loss of power, while the robot hangs: find the whole turns from the stored zero; --at
+    and --standing then need only be within 0.08 rad; unclear results are refused"""
     untouched: bool = False
-    """with --resume: you confirm that no encoder, magnet, motor or encoder cable has been touched
-    since the zero; needed for joints that have moved"""
+    """with --resume, for joints that have moved: you confirm that no encoder, magnet, motor or
+    encoder cable has been touched since the zero"""
     swing: bool = False
-    """with --resume: watch the legs swing, which shows that they hang free; for knees and hips that
-    have moved"""
+    """with --resume, for knees and hips that have moved: check by the legs' swing that they hang
+    free"""
     level: bool = False
-    """with --resume and without an IMU: you confirm that a spirit level shows the torso level to 2
+    """with --resume, without an IMU: you confirm by spirit level that the torso is level to 2
     degrees"""
     rest: bool = False
-    """change no zero; only store where the joints rest now, for --resume (`xrl down` also does
-    this)"""
+    """only store where the joints rest now, for --resume (`xrl down` also does this)"""
     yes: bool = False
     """do not ask for confirmation"""
 
@@ -103,7 +100,7 @@ class ZeroFlags(FleetRobotFlags):
         return MODULES if self.module is None else (self.module,)
 
     def check(self) -> None:
-        """Refuse one module's angles for all, and flags that contradict each other."""
+        """Refuse --at with --all, missing angles, and flags that contradict each other."""
         super().check()
         where = [self.at, self.standing]
         if self.rest and (self.resume or any(one is not None for one in where)):
@@ -117,7 +114,7 @@ class ZeroFlags(FleetRobotFlags):
 
 
 def run(flags: ZeroFlags) -> int:
-    """Check the drives, ask, write and read back; store the zero for a loss of power."""
+    """Check the drives, ask, write and read back; store the zero for use after a loss of power."""
     console = Console()
     path = drive_access.robot_file(flags)
     robot = config_file.load_without_schedule(path)
@@ -183,8 +180,8 @@ class _Zeroing(NamedTuple):
         robot, flags, console = self.robot, self.flags, self.console
         if not any(module in self.record.modules for module in flags.modules):
             raise DriveError(
-                f"{', '.join(flags.modules)}: no zero is stored; zero with a protractor (--at, "
-                "--standing), as on the first day; after that, --resume works"
+                f"{', '.join(flags.modules)}: no zero is stored for --resume; without it, zero "
+                "with --at (angles by protractor) or --standing"
             )
         up = zero_record.upright(robot, flags.run_dir, level=flags.level)
         swings: dict[str, Swing] = {}
@@ -200,7 +197,7 @@ class _Zeroing(NamedTuple):
             untouched=flags.untouched, about=about, swings=swings,
         )  # fmt: skip
         found = decide(robot, evidence, up)
-        table = _table("found, rad", "by", "second best, rad away", "its error, of the allowed one")
+        table = _table("found, rad", "by", "second best, rad away", "its error / allowed")
         taken, zeroed = {}, []
         for module in flags.modules:
             decision = found.get(module)
@@ -208,7 +205,7 @@ class _Zeroing(NamedTuple):
                 zeroed.append(module)
             elif decision is not None and decision.q is not None:
                 q = taken[module] = decision.q
-                times = f"{decision.times:.1f} times" if decision.by != "unmoved" else "-"
+                times = f"{decision.times:.1f}" if decision.by != "unmoved" else "-"
                 table.add_row(module, _angles(q), decision.by, f"{decision.second:.2f}", times)
             else:
                 why = decision.why if decision is not None else faults[module]
@@ -260,7 +257,7 @@ class _Zeroing(NamedTuple):
         return seen
 
     def _set(self, wanted: Mapping[str, Pair]) -> list[str]:
-        """Write and read back all positions, and print them; return the modules read back right."""
+        """Write and read back all positions, and print them; return those read back correctly."""
         table, done = _table("written, rad", "read back, rad", ""), []
         for module, q in wanted.items():
             try:
@@ -299,7 +296,7 @@ class _Zeroing(NamedTuple):
     def _is_its_zero(self, module: str) -> bool:
         """Return True if a drive has its stored zero again; otherwise erase the zero just written.
 
-        A joint that creeps during the write gets another zero.
+        A joint that creeps during the write gets a different zero.
         """
         drive, offsets = self.drives[module], self.record.modules[module].offsets
         seen = look(drive, self.robot)
@@ -344,7 +341,7 @@ def _angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[s
 
 
 def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | None]) -> None:
-    """Raise FleetError if a joint service holds the drive's USB or is not DISARMED."""
+    """Raise FleetError if a joint service uses a drive's USB, is silent, or is not DISARMED."""
     up = {module: fleet for module, fleet in holders.items() if fleet is not None}
     for module, fleet in up.items():
         if robot.joint_service.driver == "odrive_usb":
@@ -370,7 +367,7 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | 
             if state.mode != Mode.DISARMED:
                 raise FleetError(
                     f"{module}: its joint service is in {Mode(state.mode).name}; hang the robot "
-                    f"and run `xrl kill {module}` (a restart leaves this mode) or `xrl down` first"
+                    f"and run `xrl kill {module}` (a restart ends this mode) or `xrl down` first"
                 )
 
 
@@ -385,7 +382,7 @@ def _states(
         while time.monotonic() < deadline and len(states) < len(modules):
             for module, latest in ends.items():
                 state = latest.take()
-                if state is not None:  # its stamp is the drive's, which may be silent
+                if state is not None:  # whatever its stamp: the drive may be silent
                     states[module] = state
             time.sleep(0.01)
     return states
@@ -406,11 +403,11 @@ class StandAngles(NamedTuple):
     q: dict[str, Pair]
     """(phi, theta) of each module, rad."""
     hips_forward: float
-    """Position of the hips ahead of the ankles with the COM over the ankles, m."""
+    """Distance of the hips ahead of the ankles, m; negative if behind."""
 
 
 def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
-    """Return the stand with the torso level and its origin (between the hips) at a height, m."""
+    """Return the level stand whose torso origin (between the hips) is at a height, m."""
     from services.planner.law.kinematics import Kinematics  # noqa: PLC0415 - takes a second
     from tools.reach import ReachSolver, describe  # noqa: PLC0415
 

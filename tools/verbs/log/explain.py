@@ -132,7 +132,10 @@ def tick_at(log: RunLog, at_s: float | None, zero_ns: int) -> Tick:
         command = _find(log.messages(topics.JOINT_COMMAND, module), status.seq, status.session)
         state = _find(log.messages(topics.JOINT_STATE, module), status.state_seq[number])
         if command is None or state is None:
-            raise RunError(f"{log.path}: {module}: tick {status.seq} is incomplete in the log")
+            raise RunError(
+                f"{log.path}: {module}: the command or state of tick {status.seq} is missing; "
+                "choose another --at"
+            )
         commands.append(command)
         states.append(state)
     return Tick(status, commands, states)
@@ -203,7 +206,7 @@ def _network(log: RunLog, at_ns: int, zero_ns: int) -> str:
     """Return the impairments in force at a monotonic time; "" for a run without impairments."""
     done = impairments(log.messages(topics.LINK_EVENT))
     now = [f"{row.title}, {row.when(zero_ns)}" for row in done if row.at(at_ns)]
-    return "; ".join(now) or ("not impaired here" if done else "")
+    return "; ".join(now) or ("not impaired at this time" if done else "")
 
 
 def show(robot: RobotConfig, found: TorqueBreakdown, console: Console) -> None:

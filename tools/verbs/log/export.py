@@ -23,9 +23,8 @@ BAG_RATE_HZ: Final = 100.0
 
 
 EXAMPLES: Final = """
-xrl log export out/a/run.mcap --gif squat.gif     # the robot moving, from side and front
-xrl log export out/a/run.mcap --gif shove.gif --from 5 --to 9
-xrl log export out/a --csv tables                         # one file per topic and module
+xrl log export out/a/run.mcap --gif squat.gif
+xrl log export out/a --csv tables
 xrl log export out/a --csv t --rate 100 --topic 'joint/*/state' --topic harness/wrench
 xrl log export out/a --ros2bag bag                        # ros2 bag play bag
 """
@@ -34,20 +33,21 @@ xrl log export out/a --ros2bag bag                        # ros2 bag play bag
 class ExportFlags(PartFlags):
     """Run to export, and the formats to write."""
 
-    file: Annotated[Path, positional("FILE", help=f"{RUN_HELP}; it stays unchanged")]
+    file: Annotated[Path, positional("RUN", help=RUN_HELP)]
     gif: Path | None = None
-    """write an animated GIF of the robot from the side and the front"""
+    """write an animated GIF of the robot from side and front"""
     csv: Folder | None = None
-    """write CSV tables: one file per topic and module, with all its messages"""
+    """write CSV tables, one per topic and module"""
     topic: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
-    """only these topics in the tables, such as 'joint/*/state'; may be repeated"""
+    """only this topic in the tables, such as 'joint/*/state'; repeatable (default: all but
+    joint/*/trace, planner/checkpoint and sim/state)"""
     ros2bag: Folder | None = None
     """write a ROS 2 bag (MCAP): joint states, transforms, wrench, diagnostics"""
     rate: Annotated[
         Rate | None,
         Arg(
-            help="write one table of all topics at this rate, with the newest messages at each "
-            f"time; or rate of the bag (default: {BAG_RATE_HZ:g} Hz)"
+            help="with --csv: write one table, with the newest message of each topic at this rate; "
+            f"with --ros2bag: rate of joint states, transforms, wrench (default: {BAG_RATE_HZ:g})"
         ),
     ] = None
     force: bool = False

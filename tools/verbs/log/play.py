@@ -11,7 +11,8 @@ from typing import Annotated, Final, NamedTuple, Protocol
 import msgspec
 from rich.progress import Progress, TextColumn
 
-from shared.bus.session import RawPublisher, open_session
+from shared.bus.pubsub import RawPublisher
+from shared.bus.session import open_session
 from shared.clock import NS_PER_MS, NS_PER_S, now_ns
 from shared.config import files as config_file
 from shared.config.robot_config import expand
@@ -22,7 +23,7 @@ from tools.cli import INTERRUPTED
 from tools.flags import Arg, Run, RunDirFlags, Seconds, option
 from tools.judge.run_parts import PartFlags, part_of
 from tools.logs.run_index import RunIndex
-from tools.logs.run_log import RunPart
+from tools.logs.run_log import SEE_INFO, RunPart
 from tools.terminal import Console
 from tools.topic_keys import keys_named
 
@@ -32,31 +33,26 @@ RATE_MIN: Final = 0.001
 RATE_MAX: Final = 1000.0
 SHOW_NS: Final = 200 * NS_PER_MS
 DROPPED_NS: Final = round(4.9 * NS_PER_S)
-"""A `put` takes this long, ns, if it drops the link of a subscriber that reads nothing for 5 s."""
+"""A `put` that takes longer than this, ns, has dropped the link of a subscriber that read nothing
+for 5 s."""
 _POLL_S: Final = 0.01
 _SETTLED_S: Final = 0.1
 _FLUSH_S: Final = 1.0
-"""A closing session gives queued messages a quarter of a second, then drops them."""
+"""Wait before closing, s: a closing session drops queued messages after a quarter of a second."""
 
 EXAMPLES: Final = """
 xrl log play out/a/run.mcap
-xrl log play out/a --rate 0.5
 xrl log play out/a --from 10 --to 12.5 --topic 'joint/*/state'
 """
 
 ABOUT: Final = f"""
-Messages are sent byte for byte, in the order and at the intervals of the recording: t_ns and every
-other stamp in them are those of the recording. Late messages are sent at once.
-
-Key xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, to which no service subscribes. The player has
-its own bus and connects to no peer. Subscribers connect to the player at --listen:
-  open_session(robot, "mine", run_dir, connect=["{LISTEN}"])
-  .stream(["{PREFIX}/**"])
-Any other Zenoh 1.x peer or client can also connect there.
-
-Exit code: 0 played; 2 refused, messages could not be sent, or a subscriber that read nothing for
-5 s was dropped; 130 Ctrl-C. A subscriber that connects later misses earlier messages: the summary
-reports how many messages had no subscriber.
+Messages are sent byte for byte, in the recorded order and at the recorded intervals, divided by
+--rate. Key xrl/<robot>/x becomes {PREFIX}/xrl/<robot>/x, to which no service subscribes. The player
+connects to no peer. Subscribers, any Zenoh 1.x peers or clients, connect to --listen:
+  session = open_session(robot, "mine", run_dir, connect=["{LISTEN}"])
+  messages = session.stream(["{PREFIX}/**"])
+Exit code 2 also means that messages could not be sent, or that a subscriber that read nothing for
+5 s was dropped. The summary counts the messages sent before the first subscriber.
 """
 
 
@@ -65,9 +61,9 @@ class PlayFlags(RunDirFlags, PartFlags):
 
     file: Run
     topic: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
-    """replay only this topic, named without xrl/<robot>/, such as joint/*/state; may be repeated"""
+    """only this topic, such as 'joint/*/state'; repeatable"""
     rate: Annotated[float, Range(RATE_MIN, RATE_MAX, ""), option("--rate", "-r", metavar="R")] = 1.0
-    """recorded seconds per second"""
+    """speed relative to the recording"""
     wait: Seconds = 1.0
     """maximum wait for the first subscriber"""
     listen: Annotated[
@@ -85,7 +81,7 @@ class Entry(NamedTuple):
 
 
 def entries(index: RunIndex, part: RunPart, keys: Collection[str]) -> Iterator[Entry]:
-    """Yield a part's messages of some keys in the order of the files, one chunk in memory."""
+    """Yield a part's messages of some keys in the order of the files; hold one chunk in memory."""
     begin_ns = index.began_ns + round(part.begin_s * NS_PER_S)
     end_ns = index.ended_ns + 1
     if part.end_s < index.length_s:
@@ -98,14 +94,14 @@ def entries(index: RunIndex, part: RunPart, keys: Collection[str]) -> Iterator[E
 
 
 class _Port(Protocol):
-    """The way to one key of the bus."""
+    """Sender to one key of the bus."""
 
     def put(self, payload: bytes) -> bool:
         """Send; False if it cannot be sent."""
 
 
 class Played(msgspec.Struct):
-    """Counts of what has been played."""
+    """Counts of the messages played."""
 
     sent: int = 0
     failed: int = 0
@@ -149,7 +145,7 @@ def pace(
 
     Args:
         entries: the messages.
-        ports: the way to each of their keys.
+        ports: sender to each of their keys.
         rate: recorded seconds per second.
         played: counts to update.
         now_ns: monotonic clock.
@@ -184,7 +180,7 @@ def run(flags: PlayFlags) -> int:
     chosen = {key.topic.key(index.robot, key.module) for key in keys_named(flags.topic)}
     keys = chosen & index.keys_with_messages()
     if next(entries(index, part, keys), None) is None:
-        raise RunError("none of these topics has a message in this part of the log")
+        raise RunError(f"none of these topics has a message in this part of the log; {SEE_INFO}")
     if not index.complete or index.damage:
         words = f"{flags.file}: incomplete; replayed as far as readable; see `xrl log info`"
         console.print(words, style="yellow", markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`xrl log recover`: writes a complete copy of a log that was not finished."""
+"""`xrl log recover`: writes a finished copy of an unfinished log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from tools.terminal import Console, marked
 
 EXAMPLES: Final = """
 xrl log recover out/a/run.mcap
-xrl log recover out/a/run.mcap -o rescued.mcap
 """
 
 
@@ -23,15 +22,15 @@ class RecoverFlags(Flags):
     """Log to recover, and path of the copy."""
 
     file: Annotated[Path, positional("FILE")]
-    """MCAP file, which stays unchanged"""
+    """MCAP file"""
     out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None
     """path of the recovered file (default: NAME.recovered.mcap beside FILE)"""
     force: bool = False
-    """replace OUT if it exists"""
+    """replace existing files"""
 
 
 def run(flags: RecoverFlags) -> int:
-    """Recover the log; return 0 even if nothing is missing."""
+    """Recover the log; return 0 even if there is nothing to recover."""
     console = Console()
     path = flags.file
     if flags.out is None and recover.is_whole(path):

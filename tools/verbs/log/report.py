@@ -22,7 +22,6 @@ MIB: Final = 1 << 20
 EXAMPLES: Final = """
 xrl log report out/a/run.mcap
 xrl log report out/a/run.mcap -o report.html --open no
-xrl log report out/a/run.mcap --from 1200 --to 1260   # one minute of an hour
 """
 
 
@@ -31,9 +30,9 @@ class ReportFlags(PartFlags):
 
     file: Run
     out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None
-    """path of the page (default: NAME.html beside the log); an old page is replaced"""
+    """path of the page (default: NAME.html beside the log)"""
     open: Literal["yes", "no", "auto"] = "auto"
-    """open the page in a browser; auto: if run in a terminal with a display"""
+    """open the page in a browser; auto: only in a terminal with a display"""
 
 
 def run(flags: ReportFlags) -> int:

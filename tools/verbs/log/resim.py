@@ -31,18 +31,16 @@ SHOWN: Final = 12
 
 
 EXAMPLES: Final = """
-xrl log resim out/a/run.mcap                              # planner and six services
+xrl log resim out/a/run.mcap
 xrl log resim out/a/run.mcap --service knee_left
 xrl log resim out/a/run.mcap --service planner --param law.K_p.x=2000
 xrl log resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
 xrl log resim out/a/run.mcap --tolerance 1e-9             # recorded on another machine class
-xrl log resim out/a                                       # a split run, all of its files
-xrl log resim out/a --from 1200 --to 1260                 # one minute of a long run
 """
 
 
 class ResimFlags(ControllerFlags, PartFlags):
-    """Run and services to execute again, and what to change."""
+    """Run and services to execute again, and changes."""
 
     log: Run
     service: Annotated[
@@ -50,16 +48,16 @@ class ResimFlags(ControllerFlags, PartFlags):
         Arg(
             choices=(*SERVICES, "all"),
             metavar="NAME",
-            help=f"all (default), or one of {', '.join(SERVICES)}; may be given several times",
+            help="planner, a module such as knee_left, or all (default); repeatable",
         ),
     ] = ()
     param: Annotated[tuple[str, ...], Arg(metavar="NAME=VALUE")] = ()
-    """change a key of the robot file, such as law.K_p.x=2000 or joint_service.blend_ms=100, and
-    list the outputs that change most"""
+    """change a key of the robot file, such as law.K_p.x=2000, and list the outputs that change
+    most; repeatable"""
     tolerance: Annotated[float, Range(0.0, FINITE_MAX, ""), Arg(metavar="T")] = 0.0
     """maximum accepted difference of numbers (default: 0, equal to the last bit)"""
     workers: Annotated[Count, Arg(metavar="N")] = dataclasses.field(default_factory=cores)
-    """number of processes for a run of over a minute (default: one per core)"""
+    """processes on this machine (default: one per core)"""
 
 
 def run(flags: ResimFlags) -> int:
@@ -93,7 +91,7 @@ def run(flags: ResimFlags) -> int:
 
 
 def _executed(ranges: list[RangeTask], workers: int, console: Console) -> list[ReexecutionResult]:
-    """Execute ranges of the run, side by side if there are several."""
+    """Execute ranges of the run, in parallel if there are several."""
     if len(ranges) == 1:
         with Progress(console=console, transient=True) as progress:
             progress.add_task("executing again", total=None)
@@ -133,7 +131,7 @@ def summary(outcomes: list[ReexecutionResult]) -> Table:
 
 
 def tell(outcome: ReexecutionResult, index: RunIndex, console: Console, *, changed: bool) -> None:
-    """Print the first difference of a service, and with a changed parameter the largest."""
+    """Print a service's first difference and, if the execution was changed, the largest ones."""
     first = outcome.comparison.first
     if outcome.lost_inputs:
         console.print(

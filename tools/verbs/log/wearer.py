@@ -17,12 +17,11 @@ from tools.logs.run_log import robot_of
 from tools.terminal import Console
 
 ABOUT: Final = """
-Record a minute with park off: stand, squat down and up three times without a stop, and rest in a
-crouch. The robot file lab.toml reads the wearer file lab.wearer.toml beside it."""
+Record a minute with park off: stand, squat three times without a stop, and rest in a crouch. The
+robot file lab.toml reads the wearer file lab.wearer.toml beside it."""
 
 EXAMPLES: Final = """
 xrl log wearer out/anna/run.mcap
-xrl log wearer out/anna/run.mcap --out anna.wearer.toml
 xrl log wearer out/anna/run.mcap --from 10 --to 70 --out deploy/robot.wearer.toml
 """
 

@@ -43,28 +43,27 @@ WIDTH: Final = 72
 EXAMPLES: Final = """
 xrl log whatif out/a/run.mcap --kill planner
 xrl log whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
-xrl log whatif out/a/run.mcap --kill planner --from 5 --to 9
 """
 
 
 class WhatIfFlags(PartFlags):
     """Services to kill, and when."""
 
-    log: Annotated[Path, positional("RUN", help=f"{RUN_HELP}; of a simulated robot")]
+    log: Annotated[Path, positional("RUN", help=RUN_HELP)]
     kill: Annotated[
         tuple[str, ...],
         Arg(
             metavar="SERVICE",
             choices=KILLABLE,
-            help=f"service to kill: {', '.join(KILLABLE)}; may be given several times",
+            help="planner or a module, such as knee_left; repeatable: all are killed together",
         ),
     ]
     every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.1
-    """time between two kills; at least 0.1 s, the period at which the state is recorded"""
+    """time between two kills; at least 0.1 s, the period of the recorded states"""
     for_s: Annotated[Duration, option("--for", metavar="S")] = 4.0
-    """duration of each continued run; pushes and hand are as recorded"""
+    """duration of each continued run, with pushes and hand as recorded"""
     workers: Annotated[Count | None, Arg(metavar="N")] = None
-    """number of processes (default: one per core)"""
+    """processes on this machine (default: one per core)"""
     out: Folder | None = None
     """folder for whatif.json and whatif.png (default: beside the log)"""
 

@@ -1,4 +1,4 @@
-"""`xrl ros2 check`: checks what ROS 2 sees of the robot: router, node, topics and messages."""
+"""`xrl ros2 check`: checks the robot's router, node, topics and messages in ROS 2."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class CheckFlags(ConfigFlags):
     router: Annotated[str | None, Arg(metavar="ENDPOINT")] = None
     """endpoint of the router (default: ros2.router of the robot file)"""
     wait: Seconds = 5.0
-    """timeout for the router, for the node, and for each topic's first message"""
+    """timeout for router, node, and each topic's first message"""
 
 
 def run(flags: CheckFlags) -> int:
@@ -128,7 +128,7 @@ def _opened(router: str, domain: int, types: RosTypes, wait_s: float) -> RosSess
 
 
 def _has_rate(topic: RosTopic, known: RosTopics, robot: RobotConfig) -> bool:
-    """Return True if the robot file enables a topic; the clock is only in simulation."""
+    """Return True if the robot file enables a topic; the clock is optional."""
     ros2 = robot.ros2
     rates = {
         known.joint_states: ros2.joint_states_hz, known.tf: ros2.tf_hz,

@@ -1,1 +1,1 @@
-"""`xrl topic`: what is on the bus."""
+"""Verbs of `xrl topic`."""

@@ -25,7 +25,7 @@ POLL_S: Final = 0.002
 EXAMPLES: Final = """
 xrl topic echo planner/status --count 1
 xrl topic echo 'joint/*/state' --field q --hz 5
-xrl topic echo joint/knee_left/event              # each change of mode
+xrl topic echo joint/knee_left/event
 xrl topic echo harness/wrench --json | jq .force
 """
 
@@ -36,15 +36,15 @@ class EchoFlags(RunDirFlags):
     topic: Annotated[tuple[str, ...], positional("TOPIC")]
     """topic, such as 'joint/*/state'"""
     field: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
-    """print only this field; may be repeated"""
+    """print only this field; repeatable"""
     hz: Annotated[Rate | None, Arg(metavar="HZ")] = None
-    """at most HZ messages of each topic per second"""
+    """at most HZ messages per second of each topic and module"""
     count: Annotated[Count | None, Arg(metavar="N")] = None
     """stop after N messages"""
     for_s: Annotated[Seconds | None, option("--for")] = None
     """stop after S seconds"""
     json: bool = False
-    """print each message as a line of JSON, as on the bus"""
+    """print each message as a line of JSON"""
 
 
 def run(flags: EchoFlags) -> int:
@@ -91,7 +91,7 @@ def _print(session: Session, keys: list[TopicKey], flags: EchoFlags) -> int:
 
 
 def as_text(key: TopicKey, payload: bytes, fields: Sequence[str], *, as_json: bool) -> str:
-    """Return a message as text; "" if it lacks all the fields.
+    """Return a message as text; "" if it lacks every requested field.
 
     A payload that is not a message of the topic's type is described by its size.
     """

@@ -1,4 +1,4 @@
-// The page: takes frames from the server, shows them, and sends what a person does.
+// The page: shows the server's frames and sends the person's orders.
 import { Plots } from "./plots.js";
 import { recordedRun } from "./recorded.js";
 import { MODE_COLOURS, RobotScene } from "./scene.js";
@@ -6,11 +6,11 @@ import { MODE_COLOURS, RobotScene } from "./scene.js";
 const $ = (id) => document.getElementById(id);
 const css = (colour) => `#${colour.toString(16).padStart(6, "0")}`;
 const HINTS = {
-  record: "drag: turn · wheel: closer · space: play or pause · ← →: a frame",
-  live: "looking only · drag: turn · wheel: closer",
-  led: "drag the torso up and down: lead · shift and drag: push · drag beside it: turn",
+  record: "drag: rotate the view · wheel: zoom · space: play or pause · ← →: step by a frame",
+  live: "drag: rotate the view · wheel: zoom",
+  led: "drag the torso up or down: lead · shift-drag the torso: push · drag elsewhere: rotate the view",
 };
-const WORDS = { suspended: "frozen; start lets it go on" };
+const WORDS = { suspended: "frozen; press start to resume" };
 const CUTS = ["left leg", "right leg", "all"];
 const HEIGHT_STEP = 0.02, PITCH_STEP = 0.05, PUSH_PER_PIXEL = 0.6, FRAME_S = 1 / 30;
 
@@ -21,12 +21,12 @@ function send(message) {
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
 
-// Not linked now: it is sent as soon as the link is back, and said at once.
+// True if an E-STOP could not be sent; the page sends it after reconnecting.
 let stopWaits = false;
 
 function stop() {
   stopWaits = socket.readyState !== WebSocket.OPEN;
-  if (stopWaits) complain("E-STOP not sent, the server is gone: cut the power");
+  if (stopWaits) complain("E-STOP not sent: no connection to the server. Cut the power.");
   else send({ order: "estop" });
 }
 
@@ -51,7 +51,7 @@ async function connect() {
     if (message.playing !== undefined) $("play").textContent = message.playing ? "⏸" : "▶";
   };
   socket.onclose = () => {
-    if (!stopWaits) complain("the server is gone; this page looks for it");
+    if (!stopWaits) complain("no connection to the server; retrying");
     setTimeout(connect, 1000);
   };
   socket.onopen = () => {
@@ -85,11 +85,11 @@ function begin(given) {
     return { ...made, way };
   });
   plots = new Plots($("plots"), model.course ?? []);
-  if (model.source !== "record") $("stall").textContent = "preparing: no state yet";
+  if (model.source !== "record") $("stall").textContent = "waiting for states from all modules";
   try {
     scene = new RobotScene($("scene"), model);
   } catch (error) {
-    complain(`no three-dimensional picture: ${error.message}`);
+    complain(`3-D view not available: ${error.message}`);
   }
   if (model.end_s > model.begin_s) beginTimeline();
   if (model.orders.length || model.source === "live") beginOrders();
@@ -122,7 +122,7 @@ function beginOrders() {
   $("processes").hidden = !acts;
   for (const name of model.processes) addProcess(name);
   $("cuts").hidden = !model.orders.includes("cut");
-  for (const service of CUTS) $("cuts").append(button(`cut ${service}`, { order: "cut", service }));
+  for (const service of CUTS) $("cuts").append(button(`cut links: ${service}`, { order: "cut", service }));
 }
 
 const processRows = new Map();
@@ -152,10 +152,10 @@ function showProcesses(frame) {
   for (const process of frame.processes) {
     const { word, item } = processRows.get(process.name) ?? addProcess(process.name);
     word.textContent = process.state === "running" ? "" : WORDS[process.state] ?? process.state;
-    item.title = `${process.state}, started again ${process.restarts} times`;
+    item.title = `${process.state}, restarts: ${process.restarts}`;
   }
   $("network").hidden = !(frame.network.length || model.orders.includes("cut"));
-  $("impaired").textContent = frame.network.length ? frame.network.join("; ") : "as it is";
+  $("impaired").textContent = frame.network.length ? frame.network.join("; ") : "not impaired";
 }
 
 function show(frame) {
@@ -170,22 +170,22 @@ function show(frame) {
   $("mode").textContent = planner ? planner.mode.toLowerCase() : "silent";
   $("planner").textContent = planner
     ? [planner.why, planner.wearer, planner.wait_s > 0 ? `leads again in ${planner.wait_s.toFixed(0)} s at the earliest` : "",
-      planner.heat_left_s >= 0 && planner.heat_left_s < 3600 ? `motors: ${planner.heat_left_s.toFixed(0)} s left at this load` : "",
+      planner.heat_left_s >= 0 && planner.heat_left_s < 3600 ? `module too warm in ${planner.heat_left_s.toFixed(0)} s at this load` : "",
       `tick ${planner.tick_us?.toFixed(0) ?? "-"} µs, assist ${planner.assist_n.toFixed(0)} N, carries ${planner.carried_n.toFixed(0)} N`]
       .filter(Boolean).join("; ")
-    : "not heard: each module holds on its own";
+    : "silent: each module holds on its own";
   frame.modes.forEach((mode, index) => {
     const name = model.modes[mode] ?? "SILENT";
     moduleRows[index].word.textContent = name;
     moduleRows[index].way.textContent = frame.ways_out[index];
     moduleRows[index].dot.style.background = css(MODE_COLOURS[name]);
   });
-  if (frame.fallen) complain("it has fallen");
+  if (frame.fallen) complain("the robot has fallen");
   if (!$("timeline").hidden && document.activeElement !== $("place")) $("place").value = frame.t_s;
   if (!hand.led) Object.assign(hand, { height: frame.torso[2], pitch: frame.angles[1] });
   const [right, left] = frame.soles.map(([force]) => `${force[2].toFixed(0)} N`);
-  $("soles").textContent = !right ? "not known: a leg is straight"
-    : `right ${right}, left ${left}${!frame.soles_estimated ? "" : "; estimated from the legs' torques"}`;
+  $("soles").textContent = !right ? "unknown: a leg is too straight"
+    : `right ${right}, left ${left}${!frame.soles_estimated ? "" : "; estimated from the joint torques"}`;
   showProcesses(frame);
   scene?.show(frame);
   plots.take(frame);
@@ -196,7 +196,7 @@ function lead(height, pitch) {
   send({ order: "hand", height, pitch });
 }
 
-// Pointers: the torso leads or is pushed, everything else turns the picture.
+// Dragging the torso leads or pushes the robot; dragging elsewhere rotates the view.
 function steer() {
   const canvas = $("scene"), pointers = new Map();
   const leads = model.orders.includes("hand");
@@ -213,7 +213,7 @@ function steer() {
     if (pushing) letGo();
     const held = leads && pointers.size === 1 && scene?.isTorso(event.offsetX, event.offsetY);
     grip = held ? { x: event.clientX, y: event.clientY, force: [0, 0, 0], ...hand } : undefined;
-    if (grip && event.shiftKey)  // again and again: a push that is not repeated ends by itself
+    if (grip && event.shiftKey)  // repeated, because a push expires
       pushing = setInterval(() => send({ order: "push", force: grip.force }), 50);
   };
   canvas.onpointermove = (event) => {

@@ -1,21 +1,21 @@
-// Plots beside the robot: of a record's whole course with a line at the present place, else of the
-// last seconds.
+// Plots beside the robot: a whole record with a line at the time shown, or the last 20 seconds of a
+// running robot.
 const KEPT_S = 20, EVERY_MS = 200, JUMP_S = 1;
 const COLOURS = ["#e0702a", "#2f8fe0", "#2e8a5c", "#b46ae0", "#d98f1f", "#6b7684"];
 
 const PANELS = [
-  ["hand, N", ["hand", "push"], (f) => [f.force[2], Math.hypot(...f.push)]],
+  ["force, N", ["hand, z", "push"], (f) => [f.force[2], Math.hypot(...f.push)]],
   ["COM, mm", ["x", "y"], (f) => [1e3 * f.com[0], 1e3 * f.com[1]]],
-  ["height, m", ["torso", "COM", "COM asked for"],
+  ["height, m", ["torso", "COM", "COM reference"],
     (f) => [f.torso[2], f.com[2], f.planner ? f.planner.height_ref : null]],
-  ["pitch, rad", ["torso"], (f) => [f.angles[1]]],
-  ["age of commands, ms", ["oldest"],
+  ["torso pitch, rad", ["torso"], (f) => [f.angles[1]]],
+  ["age of the oldest command, ms", ["oldest"],
     (f) => [Math.max(...f.ages_ms) >= 0 ? Math.max(...f.ages_ms) : null]],
-  ["margin", ["with the services", "drives alone"],
+  ["certificate margin", ["joint services alone", "drives alone"],
     (f) => f.planner ? [f.planner.margin, f.planner.margin_onboard] : [null, null]],
-  ["largest torque, N m", ["ankle r", "knee r", "hip r", "ankle l", "knee l", "hip l"],
+  ["larger joint torque of each module, N m", ["ankle r", "knee r", "hip r", "ankle l", "knee l", "hip l"],
     (f) => [0, 2, 4, 6, 8, 10].map((n) => Math.max(Math.abs(f.tau[n]), Math.abs(f.tau[n + 1])))],
-  ["tick, µs", ["tick"], (f) => [f.planner ? f.planner.tick_us : null]],
+  ["planner tick time, µs", ["tick"], (f) => [f.planner ? f.planner.tick_us : null]],
 ];
 
 export class Plots {
@@ -74,7 +74,7 @@ export class Plots {
       for (const { data } of this.panels)
         while (data[0][0] < frame.t_s - KEPT_S) data.forEach((column) => column.shift());
     }
-    // after the last frame, too: a record may stand still from here on
+    // redraw after the last frame too, because a record may stop here
     this.due ??= setTimeout(() => {
       this.due = undefined;
       for (const { plot, data } of this.panels) plot.setData(data);

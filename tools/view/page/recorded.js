@@ -1,4 +1,4 @@
-// A run that is in the page itself: it answers as the server does, and needs none.
+// A run stored in the page itself, which replaces the connection to the server.
 const EVERY_MS = 1000 / 30;
 
 export async function recordedRun() {
@@ -9,7 +9,7 @@ export async function recordedRun() {
   return new RecordedRun(await new Response(unpacked).json());
 }
 
-// The part of a WebSocket that the page uses.
+// Implements the part of the WebSocket interface that the page uses.
 class RecordedRun {
   constructor({ model, frames, every_s }) {
     model.course = frames.filter(Boolean);

@@ -1,4 +1,4 @@
-// The robot in three dimensions. Axes as on the robot: x forward, y left, z up; m, rad.
+// 3-D view of the robot. Axes as on the robot: x forward, y left, z up. Units: m, rad.
 import * as T from "./vendor/three/three.module.min.js";
 
 export const MODE_COLOURS = {
@@ -10,7 +10,7 @@ const X = new T.Vector3(1, 0, 0), Y = new T.Vector3(0, 1, 0), Z = new T.Vector3(
 
 const turn = (axis, angle) => new T.Quaternion().setFromAxisAngle(axis, angle);
 
-// From the foot up a module is Rx(phi) Ry(theta); from the torso down it is the inverse.
+// From the foot up, a module rotates by Rx(phi) Ry(theta); from the torso down, by the inverse.
 const moduleTurn = (phi, theta) => turn(Y, -theta).multiply(turn(X, -phi));
 
 // Rz(yaw) Rx(roll) Ry(pitch)
@@ -21,7 +21,7 @@ class Arrow extends T.Group {
   constructor(colour, metresPerNewton = METRES_PER_NEWTON) {
     super();
     this.metresPerNewton = metresPerNewton;
-    // seen through the torso, in which it begins
+    // visible through the torso, inside which the arrow begins
     const paint = new T.MeshBasicMaterial({ color: colour, depthTest: false, transparent: true });
     this.shaft = new T.Mesh(new T.CylinderGeometry(0.012, 0.012, 1, 12), paint);
     this.tip = new T.Mesh(new T.ConeGeometry(0.035, 0.08, 16), paint);
@@ -30,7 +30,7 @@ class Arrow extends T.Group {
     this.visible = false;
   }
 
-  // A force, N, at a place of its parent.
+  // Show a force, N, at a position in the parent's frame.
   show(force, place) {
     const vector = new T.Vector3(...force), size = vector.length();
     this.visible = size >= FORCE_MIN_N;
@@ -44,7 +44,7 @@ class Arrow extends T.Group {
   }
 }
 
-// A convex polygon of up to so many corners: its outline and its face.
+// Outline and face of a convex polygon with at most `most` corners.
 class Polygon extends T.Group {
   constructor(most, colour) {
     super();
@@ -67,7 +67,7 @@ class Polygon extends T.Group {
   }
 }
 
-// Torso and legs as nested groups, so that each takes its own joint angles.
+// Torso and legs as nested groups, so that each rotates by its own joint angles.
 class Skeleton extends T.Group {
   constructor(model, paintOf) {
     super();
@@ -202,7 +202,7 @@ export class RobotScene {
     this.draw();
   }
 
-  // Corners of both soles on the floor.
+  // Return the corners of both soles.
   corners() {
     const [length, width, height] = this.model.foot, found = [];
     for (const name of this.model.modules.filter((each) => each.startsWith("ankle")))
@@ -223,29 +223,29 @@ export class RobotScene {
     this.renderer.render(this.world, this.camera);
   }
 
-  // The body under a place of the canvas, px: the torso's box or nothing.
+  // Return true if the torso is under a position on the canvas, px.
   isTorso(x, y) {
     const { width, height } = this.canvas.getBoundingClientRect();
     const ray = new T.Raycaster();
     ray.setFromCamera(new T.Vector2(2 * x / width - 1, 1 - 2 * y / height), this.camera);
-    // of the robot's bodies: an arrow before them, seen or not, is nothing to take hold of
+    // only the robot's bodies: an arrow, visible or not, must not block the torso behind it
     const hit = ray.intersectObject(this.robot, true).find(({ object }) => object.userData.frame);
     return hit?.object.userData.frame === "torso";
   }
 
-  // Metres in the plane of the picture, at the torso, for a pixel.
+  // Return metres per pixel at the torso's distance.
   metresPerPixel() {
     const away = this.camera.position.distanceTo(this.robot.frames.torso.position);
     return 2 * away * Math.tan(this.camera.fov * Math.PI / 360) / this.canvas.clientHeight;
   }
 
-  // A horizontal direction in the world for one to the right in the picture.
+  // Return the horizontal world direction that points right in the picture.
   right() {
     return new T.Vector3(-Math.sin(this.look.azimuth), Math.cos(this.look.azimuth), 0);
   }
 }
 
-// Convex hull in the plane of the floor, by Andrew's monotone chain.
+// Convex hull in the floor plane, by Andrew's monotone chain algorithm.
 function hull(points) {
   const sorted = points.slice().sort((a, b) => a.x - b.x || a.y - b.y);
   const turnsRight = (a, b, c) => (b.x - a.x) * (c.y - a.y) - (b.y - a.y) * (c.x - a.x) <= 0;

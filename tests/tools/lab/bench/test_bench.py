@@ -96,7 +96,7 @@ def tree(tmp_path: Path) -> Path:
 def test_a_run_that_fell_is_an_error_with_its_last_lines(tree: Path) -> None:
     program = "print('Verdict'); print('one'); print('FELL at 3.1 s'); print('files'); exit(1)"
     (tree / "tools/cli.py").write_text(program)
-    with pytest.raises(RunError, match=r"ended with 1: one / FELL at 3\.1 s / files"):
+    with pytest.raises(RunError, match=r"ended with exit code 1: one / FELL at 3\.1 s / files"):
         run_tree(tree, ["demo"])
 
 

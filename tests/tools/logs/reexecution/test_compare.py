@@ -130,13 +130,13 @@ def origin(**changes: str) -> Origin:
     ],
 )
 def test_what_differs_is_told(changes: dict[str, str], told: str) -> None:
-    assert likely_reason(origin(**changes), origin()) == f"likely reason, recorded with {told}"
+    assert likely_reason(origin(**changes), origin()) == f"likely reason: recorded with {told}"
 
 
 def test_all_that_differs_is_told_in_one_line() -> None:
     found = likely_reason(origin(architecture="aarch64", numpy="2.3"), origin())
     assert found == (
-        "likely reason, recorded with architecture aarch64, here x86_64; numpy 2.3, here 2.4"
+        "likely reason: recorded with architecture aarch64, here x86_64; numpy 2.3, here 2.4"
     )
 
 

@@ -1,1 +1,1 @@
-"""The crash matrix: the service that dies, the expected outcome, and the judgement."""
+"""Crash matrix: the parts that fail, the expected outcomes, and the verdicts."""

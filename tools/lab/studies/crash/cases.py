@@ -1,7 +1,8 @@
-"""The crash matrix as data: the service that dies, the expected state of the robot, and the reason.
+"""The crash matrix as data: the parts that fail, the expected outcome, and its reason.
 
-In every case the operator leads a squat, and the crash comes on the way down, at about 1.0 m. Two
-pushes follow. Then the lost services are restarted on request, and the operator leads again.
+In every case the operator leads a squat. The crash comes on the way down, with the torso at about
+1.0 m. Two pushes follow. Then the lost services are restarted on request, and the operator leads
+again.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from tools.live.scenario_runner import TriggeredKill
 
 CRASH_S: Final = 2.4
 REQUEST_S: Final = 5.0
-"""Time at which a person requests a module in FAULT, so that its service is ended, s."""
+"""Time at which a person ends the service of a module in FAULT, s."""
 BACK_S: Final = 5.2
-"""Time at which it is restarted, as is every service that was killed or stopped, s."""
+"""Time at which that service, and every killed or stopped one, is restarted, s."""
 FAULT_LASTS_S: Final = 2.0
-"""Duration of a fault of a cable, a supply or an encoder, s: it ends well before the request."""
+"""Duration of a fault of a cable, supply or encoder, s; it ends before `REQUEST_S`."""
 DURATION_S: Final = 8.0
 
 HAND: Final = (
@@ -47,7 +48,7 @@ PUSHES: Final = (
 )
 
 CRASHED: Final = tuple(name for name in SERVICES if name not in ("simulator", *OPTIONAL))
-"""Services to kill, except the simulator: it is the world and the drives, which a robot lacks."""
+"""Services to kill; a robot has no simulator."""
 
 
 class CrashVerdict(StrEnum):
@@ -66,7 +67,7 @@ class CrashCase(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     kind: str
-    """Kind of crash; `--quick` has at least one case of each kind."""
+    """Kind of crash; `--quick` runs one case of each kind."""
     crash: tuple[Kill | Fault, ...]
     expected: CrashVerdict = CrashVerdict.STOOD
     """Worst allowed verdict."""
@@ -118,7 +119,7 @@ def scenario_of(case: CrashCase) -> Scenario:
 
 
 def describe(case: CrashCase) -> str:
-    """Return the actions of a case."""
+    """Return the actions of a case as text."""
     scenario = scenario_of(case)
     words = [
         f"{row.service} {row.signal} at {row.at:g} s" for row in scenario.kill if row.at <= CRASH_S
@@ -135,7 +136,7 @@ def describe(case: CrashCase) -> str:
 LIMP: Final = {
     "ankle": (
         CrashVerdict.FELL,
-        "no torque turns its sole against the floor: a push to its side tips it",
+        "its sole carries no moment: a push to its side tips the robot",
     ),
     "knee": (
         CrashVerdict.STOOD,
@@ -161,9 +162,9 @@ FAULTED: Final[tuple[tuple[FaultKind, Sequence[str], str, str], ...]] = (
     ("bus_full", ("knee_left",), "", "dead bus"),
     ("bus_flap", ("knee_left",), "", "dead bus"),
 )
-"""Fault, modules, the module of the short run, and kind of crash.
+"""Fault, modules, the module in `--quick`, and kind of crash.
 
-Left and right are mirrored. One module is enough where the fault leaves it as limp as `disarmed`
+Left and right are symmetric. One module is enough where the fault leaves it as limp as `disarmed`
 does, and only the error's name differs. On a dead bus a drive holds its last target."""
 _DEAD_BUS: Final = ("no_ack", "bus_full", "bus_flap")
 _LASTING: Final = ("encoder", "encoder_zero", "link_lost", "over_temperature", *_DEAD_BUS)

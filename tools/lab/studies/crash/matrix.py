@@ -1,4 +1,4 @@
-"""`xrl study crash`: parts of a live fleet die one after the other, and the robot is judged.
+"""`xrl study crash`: makes parts of a live fleet fail, case by case, and judges the robot.
 
 The verdict comes from the live bus, not from the log, because the recorder may be the dead service.
 """
@@ -62,13 +62,13 @@ from tools.terminal import Console, marked
 Show = Callable[[LiveSnapshot], None]
 
 TRIES: Final = 2
-"""Maximum number of tries. A run that the machine disturbed, or that did not get far enough, is
-repeated, but never one in which the robot fell; the log of a fall is kept."""
+"""Maximum number of tries. A run is repeated if the machine disturbed it or it ended too early,
+but never after a fall, whose log is kept."""
 SANK_M: Final = 0.05
-"""A robot has sunk if its torso is this far below both its height at the crash and the hand's
-lowest, m. HOLD's springs and the hand give way by 0.01 m."""
+"""A robot has sunk if its torso is this far below both its height at the crash and the
+hand's lowest height, m. HOLD's springs and the hand yield by 0.01 m."""
 UNSAFE: Final = (Mode.FAULT, Mode.DAMP, Mode.DISARMED)
-"""Modes that a module that was not hit must not enter."""
+"""Modes that the modules in `CrashCase.others` must not enter."""
 
 
 class CrashMessages(NamedTuple):
@@ -76,7 +76,7 @@ class CrashMessages(NamedTuple):
 
     truth: Sequence[SimTruth]
     events: Sequence[tuple[str, JointEvent]]
-    """With their modules, in order for each module."""
+    """Changes of mode with their modules, in order for each module."""
     actions: Sequence[RunEvent]
     """Kills, restarts and other actions on the run."""
     modes: Sequence[str]
@@ -86,10 +86,7 @@ class CrashMessages(NamedTuple):
 
 
 class CrashResult(msgspec.Struct, frozen=True, kw_only=True):
-    """The figures of a case; None where nothing was measured.
-
-    "Before" and "after" refer to the crash; restarts come later.
-    """
+    """The figures of a case; None where nothing was measured."""
 
     verdict: CrashVerdict
     fell_after_s: float | None = None
@@ -97,19 +94,19 @@ class CrashResult(msgspec.Struct, frozen=True, kw_only=True):
     safe_ms: float | None = None
     """Time from the crash to HOLD, slowest of the modules not hit; None if not all held."""
     torque_step_nm: float | None = None
-    """Largest step of their torques on entering HOLD, N m."""
+    """Largest step of these modules' torques on entering HOLD, N m."""
     torque_step_back_nm: float | None = None
     """Largest step of any module's torque at a change of mode after the request, N m."""
     leads_again_s: float | None = None
-    """Restart to last TRACK, s; None if a module does not track or none ever left TRACK."""
+    """Restart to last TRACK, s; None if a module does not track at the end, or none left TRACK."""
     com_x_mm: float | None = None
-    """Largest value after the crash, with its sign."""
+    """Largest distance of the COM from the middle after the crash, with its sign."""
     com_y_mm: float | None = None
     sank_mm: float | None = None
-    """Distance of the torso below both its height at the crash and the hand's lowest."""
+    """Distance of the torso below both its height at the crash and the hand's lowest height."""
     sole_tilt_max_rad: float | None = None
     in_real_time: bool = True
-    """False if the machine was too slow, so that the figures are not those of a robot."""
+    """False if the machine was too slow for the figures to be valid."""
     remarks: str | None = None
     """Deviations from the expected outcome, as text."""
     tries: int = 1
@@ -241,7 +238,7 @@ def _remarks(
 def run_case(
     case: CrashCase, robot: RobotConfig, out: Path, show: Show, *, seed: int = 0
 ) -> CrashResult:
-    """Run a case, and run it again if the first try was disturbed and the robot stood.
+    """Run a case, and repeat it if the first try was disturbed or ended too early (`TRIES`).
 
     `out` is the folder of the case; `show` receives the run's snapshots.
     """
@@ -350,7 +347,6 @@ xrl study crash --quick
 xrl study crash --out out/matrix
 xrl study crash --only kill-knee_left
 xrl study crash --only 'pair-*' --only 'disarmed-*'
-xrl study crash --list
 """
 
 
@@ -358,21 +354,21 @@ class CrashFlags(ConfigFlags):
     """Cases to run."""
 
     quick: bool = False
-    """one case of each kind, in 5 minutes or less"""
+    """run one case of each kind; takes less than 5 minutes"""
     only: Annotated[tuple[str, ...], Arg(metavar="NAME")] = ()
-    """only this case, or those that match a pattern such as 'kill-*'; may be repeated"""
+    """only this case or pattern, such as 'kill-*'; repeatable"""
     list: bool = False
-    """print the cases and run none"""
+    """only list the cases"""
     out: Annotated[
         Path | None,
         Arg(
             metavar="DIR",
-            help=f"folder of {TABLE} and of each case (default: out/crash-<time>); an interrupted "
-            "matrix resumes there, and a case that did not stand keeps its run.mcap",
+            help=f"folder for {TABLE} and the cases, in which an interrupted study resumes; a case "
+            "that fell or was worse than expected keeps its run.mcap (default: out/crash-<time>)",
         ),
     ] = None
     seed: Natural = 0
-    """seed of the sensors' noise"""
+    """seed of sensor noise, network losses and delays"""
 
 
 def run(flags: CrashFlags) -> int:
@@ -483,7 +479,6 @@ def _print_cases(cases: Sequence[CrashCase], console: Console) -> None:
 
 
 def _line_of(row: Row) -> Text:
-    """Return a result in one line."""
     words = [marked("{} {}", Text(f"{row['verdict'].upper():8}", SHOWN[row["verdict"]][1]),
                     row["name"])]  # fmt: skip
     if not is_good(row):

@@ -67,7 +67,7 @@ class CaseRun(NamedTuple):
     events: Sequence[tuple[str, JointEvent]]
     """Changes of mode, with their modules."""
     messages: Sequence[tuple[str, Message]]
-    """Messages of the requested kinds, with their modules."""
+    """Messages of the requested types, with their modules."""
 
     @property
     def began(self) -> bool:
@@ -75,7 +75,7 @@ class CaseRun(NamedTuple):
         return bool(self.rows) and self.rows[0].scenario_s >= 0.0
 
     def ended(self, end_s: float, robot: RobotConfig) -> dict[str, Any]:
-        """Return the figures of `Ended` of a case that ends at a scenario time, s."""
+        """Return the figures of `Ended`; the planned end `end_s` is in scenario time."""
         if not self.rows:
             return {"ending": Ending.UNREADY}
         last = self.rows[-1]
@@ -98,7 +98,7 @@ def run_fleet(
     """Run a case in virtual time to its end or to the fall.
 
     Rows count from the scenario time `from_s`. The network applies to every link, in addition to
-    the scenario's own impairments. Messages of the kinds `kept` are kept. `each` receives every
+    the scenario's own impairments. Messages of the types `kept` are returned. `each` receives every
     row before the observer.
     """
     messages: list[tuple[str, Message]] = []
@@ -172,7 +172,8 @@ class Ending(StrEnum):
     STOOD = "stood"
     FELL = "fell"
     TIPPING = "tipping"
-    """Not fallen at the end, but a sole has lifted or the COM is beyond the soles: it will fall."""
+    """Not fallen at the end, but about to fall: a sole has lifted, the COM is beyond the soles, or
+    the torso has turned."""
     UNREADY = "unready"
     """The robot stands, but not all six modules tracked, so the scenario did not start."""
 

@@ -1,4 +1,4 @@
-"""`xrl study kill`: kills the planner at random, in random postures and under pushes.
+"""`xrl study kill`: kills the planner at random times, in random postures and under pushes.
 
 The seed and the number of a case determine it.
 """
@@ -55,7 +55,8 @@ from tools.sim.lockstep import Lockstep
 from tools.terminal import Console
 
 PAYLOADS: Final = 5
-"""kg, evenly spaced from 0 to `mass.payload_max`; each needs its own gain schedule."""
+"""Number of payloads, evenly spaced from 0 to `mass.payload_max`; each needs its own gain
+schedule."""
 HEIGHT: Final = (0.79, 1.2)
 """m, torso above the ankles: from the crawl to standing."""
 HEIGHT_UPRIGHT: Final = (0.85, 1.2)
@@ -65,18 +66,18 @@ PITCH_MAX: Final = 1.2
 LIMIT_MARGIN: Final = 0.05
 """Minimum distance of a posture from the joint limits, rad."""
 PACE: Final = (0.8, 1.6)
-"""Factors on `SPEED`."""
+"""Range of the factor on `SPEED`."""
 SPEED: Final = (0.1, 0.24, 40.0)
 """m/s, rad/s, N/s: mean speeds of the squat (height) and of the crawl (pitch, assist)."""
 LEG_MIN_S: Final = 1.0
 START_S: Final = 0.5
-"""Time that the robot stands still before the first leg, s."""
+"""Time that the robot stands still before it is led, s."""
 STILL_S: Final = (0.3, 1.0)
-"""Time that it stands still before the kill, in cases without motion, s."""
+"""Range of times that the robot stands still before the kill, if the case is not `moving`, s."""
 LET_GO_S: Final = 1.0
 """Maximum time from letting go to the kill, s."""
 PUSH_SHARE: Final = (0.1, 1.0)
-"""Fractions of the largest drawn push (`PushRange`)."""
+"""Range of the drawn pushes, as fractions of the largest one (`PushRange`)."""
 PUSH_S: Final = 0.3
 PUSHES_MAX: Final = 3
 PUSH_COLUMNS: Final = ("at_s", "x_n", "y_n")
@@ -84,8 +85,8 @@ POSES_MAX: Final = 2
 AFTER_KILL_S: Final = 3.0
 AFTER_PUSH_S: Final = 1.7
 AFTER_LEAD_S: Final = 2.0
-"""Time that a case continues after the kill, the last push and, with the hand on, the end of the
-way, s: an operator who keeps leading a robot that holds tips it slowly."""
+"""Time for which a case continues after the kill, the last push and, with the hand on, the end of
+the way, s. An operator who keeps leading a holding robot tips it slowly."""
 DELAY_MAX_MS: Final = 20.0
 
 
@@ -104,7 +105,7 @@ class KillCase(msgspec.Struct, frozen=True, kw_only=True):
     """Time at which the operator reaches the last pose, with the hand on."""
     kill_s: float
     let_go_s: float | None
-    """Time at which the operator takes the hand off, or None. The rested weight stays."""
+    """Time at which the operator takes the hand off, or None. The resting weight stays."""
     delay_ms: float
     pushes: tuple[Push, ...]
 
@@ -377,11 +378,12 @@ def robots_of(
 ) -> list[RobotConfig]:
     """Return the robot with the payload of each case, and a gain schedule that fits.
 
-    A certified schedule depends on the payload and takes seconds, so processes compute them.
+    A certified schedule depends on the payload and takes seconds to compute, so several processes
+    compute them.
 
     Raises:
         RunError: no local gains meet the certificate with a payload; names it.
-        MissingPackageError: a schedule and CVXPY are missing.
+        MissingPackageError: a schedule is missing, and CVXPY is not installed.
     """
     weights = sorted({case.payload_kg for case in cases})
     ready = {weight: with_payload(robot, weight) for weight in weights}
@@ -427,7 +429,6 @@ FIGURES: Final = (
 EXAMPLES: Final = """
 xrl study kill
 xrl study kill --n 500 --seed 1 --out out/kill
-xrl study kill --only 137 --seed 1
 xrl study kill --only 137 --seed 1 --out out/case137
 """
 
@@ -436,7 +437,7 @@ class KillStudyFlags(StudyFlags, LawFlags, PushFlags):
     """Number of cases, and the law."""
 
     n: Count = 500
-    """cases"""
+    """number of cases"""
 
 
 def describe(row: Row) -> str:

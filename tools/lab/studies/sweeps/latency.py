@@ -1,9 +1,9 @@
-"""`xrl study latency`: three controls over networks from good to hopeless, under pushes.
+"""`xrl study latency`: compares three controls over good and bad networks, under pushes.
 
-The fleet starts and is led over a good network. At a random time every link is impaired, both ways,
-to the end. That time, the pushes and the lost messages are random. They are the same for every
-delay and control, but differ between repeats, losses and jitters, so a control's trials at one
-delay are independent.
+The fleet starts and is led over a good network. From a random time to the end, every link is
+impaired in both directions. That time, the pushes and the lost messages are random. They are the
+same for every delay and control, but differ between repeats, losses and jitters, so a control's
+trials at one delay are independent.
 """
 
 from __future__ import annotations
@@ -57,12 +57,14 @@ SQUATS: Final = ((0.5, 0.0), (3.0, 0.24), (5.5, 0.0), (8.0, 0.24))
 """Time, s, and depth below the stand, m, as in the paper's Fig. 7, at its pace."""
 DURATION_S: Final = 7.0
 IMPAIRED_FROM_S: Final = (0.1, 2.5)
-"""Range of start times, all on the first way down, s; a robot that holds then holds there."""
+"""Range of times at which the impairment starts, s: in the stand or on the first way down. A robot
+that then goes to HOLD stays at that height."""
 PUSH_SHARE: Final = (0.2, SHARE)
 PUSH_S: Final = 0.3
 PUSHES: Final = 3
 PUSHED_UNTIL_S: Final = 5.3
-"""The pushes come over the bad network, one in each third of the time, at random moments."""
+"""Time at which the last push has ended, s. The pushes come over the bad network: one in each third
+of the time from the impairment until then, at a random moment."""
 
 
 class _ControlKind(NamedTuple):
@@ -78,15 +80,14 @@ class _ControlKind(NamedTuple):
 
 CONTROLS: Final = {
     "distributed": _ControlKind(
-        "as shipped: local gains certified, the rest by the planner",
+        "as shipped",
         Lockstep, None, "#1b7f4b", "o",
     ),
     "diagonal": _ControlKind(
         "the paper's local gains, diag(K_q)", Lockstep, "diagonal", "#c77700", "s"
     ),
     "centralised": _ControlKind(
-        "every torque by the planner, without a lower tier: gains not retuned for the delay, no "
-        "damping on the drives, the last torques kept while none arrive, overload ignored",
+        "all torques by the planner, without a lower tier, retuned gains or drive damping",
         CentralisedLockstep, None, "#7b3fa0", "^",
     ),
 }  # fmt: skip
@@ -94,7 +95,7 @@ CONTROLS: Final = {
 
 
 class Network(msgspec.Struct, frozen=True):
-    """Impairment of every link, each way. The links use datagrams, so no message waits."""
+    """Impairment of every link, each way. Links use datagrams, so no message waits for another."""
 
     delay_ms: float
     jitter_ms: float
@@ -235,7 +236,6 @@ def run_trial(
 
 
 def _torque_step_nm(run: CaseRun, from_ns: int) -> float:
-    """Return `_LatencyResult.torque_step_nm`."""
     largest = 0.0
     for module in MODULES:
         states = [m for name, m in run.messages if name == module and isinstance(m, JointState)]
@@ -245,7 +245,7 @@ def _torque_step_nm(run: CaseRun, from_ns: int) -> float:
 
 
 def hold_share(events: Sequence[tuple[str, JointEvent]], from_ns: int, to_ns: int) -> float:
-    """Return the fraction of a time in which a module held; `events` start with the run."""
+    """Return the fraction of a period in which any module held, from the whole run's `events`."""
     if to_ns <= from_ns:
         return 0.0
     holding: set[str] = set()
@@ -270,7 +270,7 @@ DELAY_MAX_MS: Final = 60_000.0
 
 
 def values_up_to(high: float) -> Callable[[str], tuple[float, ...]]:
-    """Return a parser for argparse: `0,10,50` as ascending numbers without repeats."""
+    """Return a parser for argparse that reads `0,10,50` as ascending numbers without repeats."""
 
     def read(text: str) -> tuple[float, ...]:
         try:
@@ -279,7 +279,7 @@ def values_up_to(high: float) -> Callable[[str], tuple[float, ...]]:
             found = {math.nan}
         if not all(0.0 <= value <= high for value in found):
             raise argparse.ArgumentTypeError(
-                f"{text!r}: must be numbers from 0 to {high:g} with commas, such as 0,0.5"
+                f"{text!r}: must be numbers from 0 to {high:g} separated by commas, such as 0,0.5"
             )
         return tuple(sorted(found))
 
@@ -292,8 +292,6 @@ _SHARES: Final = values_up_to(1.0)
 EXAMPLES: Final = """
 xrl study latency
 xrl study latency --delay 0,50,150 --jitter 5 --loss 0,0.2 --n 10 --out out/latency
-xrl study latency --control distributed --delay 0,30,60 --loss 0
-xrl study latency --only 137 --out out/trial137
 xrl study latency --cluster tcp://HOST:8786
 """
 
@@ -305,22 +303,22 @@ class LatencyStudyFlags(StudyFlags):
         tuple[float, ...],
         parsed(
             _DELAYS, "MS", is_one=True,
-            help="delay of every link, each way; several with commas "
+            help="delay of every link, each way; or several, separated by commas "
             f"(default: {DELAYS_MS})",
         ),
     ] = _DELAYS(DELAYS_MS)  # fmt: skip
     jitter: Annotated[tuple[float, ...], parsed(_DELAYS, "MS", is_one=True)] = (0.0,)
-    """half the width of a uniform spread; several as for --delay (default: 0)"""
+    """half the width of the uniform jitter; or several (default: 0)"""
     loss: Annotated[
         tuple[float, ...],
         parsed(
             _SHARES, "P", is_one=True,
-            help="fraction of the messages that is lost; several as for --delay "
+            help="probability that a message is lost; or several "
             f"(default: {LOSSES})",
         ),
     ] = _SHARES(LOSSES)  # fmt: skip
     n: Count = 4
-    """trials per network"""
+    """trials per network and control"""
     control: Annotated[
         tuple[str, ...],
         parsed(
@@ -392,7 +390,7 @@ def cells_of(rows: Sequence[Row]) -> dict[tuple[str, float], _Cell]:
 
 
 def mix(rows: Sequence[Row]) -> str:
-    """Return the networks that are mixed at each delay, as text."""
+    """Return the losses and jitters that each delay combines, as text."""
     losses = sorted({float(row["loss"]) for row in rows})
     jitters = sorted({float(row["jitter_ms"]) for row in rows})
     words = ", ".join(f"{100 * loss:g}" for loss in losses) + " % lost"

@@ -61,7 +61,7 @@ def shipped() -> _Ranges:
 
 
 def draw(seed: str, beyond: float = 1.0) -> PlantConfig:
-    """Return a plant that is determined by a text; `beyond` widens the ranges.
+    """Return the plant that a seed determines; `beyond` widens the ranges.
 
     Raises:
         ConfigError: a key does not exist in the plant, or a drawn value is impossible.
@@ -80,7 +80,7 @@ def draw(seed: str, beyond: float = 1.0) -> PlantConfig:
 
 
 def errors_of(plant: PlantConfig) -> dict[str, float]:
-    """Return each drawn error as one number: its value, or the largest absolute of several."""
+    """Return each drawn error as one number: its value, or the largest of several by magnitude."""
     table = msgspec.to_builtins(plant)
     found = {}
     for row in shipped().error:
@@ -105,13 +105,13 @@ def _drawn(dice: random.Random, row: _ErrorRange, beyond: float) -> float:
 class PushRange:
     """The largest constant push that a standing robot withstands, by direction.
 
-    It is the physical limit (`LoadedStand.limit_of_body`) under any control. Forwards and back it
-    is smallest in the stand; sideways it differs from squat and crawl by less than a quarter. For
-    the shipped robot it is 76 to 158 N.
+    It is the physical limit under any control (`LoadedStand.limit_of_body`): 76 to 158 N for the
+    shipped robot. Forwards and back, the limit is smallest in the stand. Sideways, the squat
+    withstands about as much as the stand, and the crawl a quarter more.
     """
 
     def __init__(self, robot: RobotConfig, most: float = SHARE) -> None:
-        """Compute the stand of a robot on a level floor; `draw` goes up to `most` of the limit."""
+        """Compute the stand on a level floor; `draw` goes up to a fraction `most` of the limit."""
         self._most = most
         self._stand, _ = torso_at(robot, robot.simulation.stand_height, 0.0)
 
@@ -128,7 +128,7 @@ class PushRange:
     def draw(
         self, dice: random.Random, shares: tuple[float, float], at: float, duration: float
     ) -> Push:
-        """Return a push in a random direction, with a random fraction of the largest one drawn."""
+        """Return a push in a random direction; `shares` bounds its fraction of the largest push."""
         share, angle = self._most * dice.uniform(*shares), dice.uniform(-math.pi, math.pi)
         return self.push(at, duration, share, angle)
 
@@ -146,8 +146,8 @@ class PushFlags(Flags):
         Range(1e-3, SHARE_MAX, ""),
         Arg(
             metavar="SHARE",
-            help="largest push, as a fraction of what soles and motors withstand in the stand, in "
-            "each direction: 1 is 76 N forwards and 158 N sideways for the shipped robot",
+            help="largest push, as a fraction of what soles and motors withstand in the stand: 1 "
+            "is 76 N forwards and 158 N sideways for the shipped robot",
         ),
     ] = SHARE
 

@@ -2,7 +2,7 @@
 
 With a single worker in the cluster, joblib runs the cases here instead. No process is left behind:
 a worker ignores Ctrl-C, and ends when the process that started it ends. A cluster's workers run
-their own copy of this project's code, so each compares it with the study's.
+their own copies of this project's code, so each worker compares its copy with the study's code.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ def results(
     """Yield each task with its result when it is done, in any order.
 
     Leaving the loop early, by an exception or by `close`, ends the rest at once. `work` is a
-    module-level function. `name` returns a task's name for an error. With one worker the tasks run
-    in this process. With the address of a Dask scheduler its workers run them.
+    module-level function. `name` returns a task's name for an error. With one worker, the tasks run
+    in this process. If `cluster` is the address of a Dask scheduler, its workers run them.
 
     Raises:
         RunError: no worker can be started or reached, the work failed on a task, a worker died, or
@@ -108,7 +108,10 @@ def results(
 def _run(work: Callable[[T], R], digest: str, number: int, task: T, name: str) -> tuple[int, R]:
     """Do the work in a worker; `digest` is that of the study's code, or empty if it is the same."""
     if digest not in ("", code_digest()):
-        raise RunError(f"{name}: a worker of the cluster has different code; install the same code")
+        raise RunError(
+            f"{name}: a worker of the cluster has different code; install the same code on every "
+            "worker"
+        )
     try:
         with _one_at_a_time:
             return number, work(task)
@@ -151,7 +154,9 @@ def _cluster(address: str) -> Iterator[None]:
     """Run tasks on a Dask cluster; Dask's log lines are suppressed, errors are raised here."""
     scheme, _, place = address.partition("://")
     if scheme not in ("tcp", "tls") or ":" not in place:
-        raise RunError(f"--cluster {address}: must be tcp://HOST:PORT of a Dask scheduler")
+        raise RunError(
+            f"--cluster {address}: must be tcp://HOST:PORT or tls://HOST:PORT of a Dask scheduler"
+        )
     require("cluster", "remove --cluster")
     dask = importlib.import_module("distributed")
     logging.disable(logging.CRITICAL)

@@ -1,7 +1,7 @@
 """`xrl study push`: the largest withstood push by direction, duration, pose and mode, by bisection.
 
-The robot stands up and is led to the pose. For the mode `dead` the planner is then killed. Each
-push begins from that same moment.
+The robot stands up and is led to the pose. For the mode `dead` the planner is then killed. All
+pushes of the bisection start from the same saved state.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def run_trial(trial: PushTrial, robot: RobotConfig, _observer: Observer = NOBODY
 
 
 def limits_of(trial: PushTrial, robot: RobotConfig) -> PushLimits:
-    """Return the static limits of the trial's pose and direction, on the robot file's robot."""
+    """Return the static limits of the trial's pose and direction, without the plant's errors."""
     schedule = robot.gain_schedule
     if schedule is None:
         raise RunError("the robot has no gain schedule; run `xrl gains`")
@@ -146,7 +146,7 @@ def _start_of(trial: PushTrial, robot: RobotConfig) -> FleetMoment:
         if truth.scenario_s >= BEGIN_S - 0.1:
             break
     if fleet.world.scenario_s < BEGIN_S - 0.1:
-        raise RunError(f"{trial.pose}: the six modules did not track")
+        raise RunError(f"{trial.pose}: not all six modules tracked, so no push was tried")
     moment = fleet.moment()
     return moment if trial.mode == "led" else msgspec.structs.replace(moment, planner=None)
 
@@ -185,17 +185,18 @@ class PushStudyFlags(StudyFlags, PlantFlags):
     """Points to measure."""
 
     pose: Annotated[tuple[str, ...], Arg(choices=tuple(POSES))] = ()
-    """only this pose; may be repeated"""
+    """only this pose; repeatable"""
     angle: Annotated[tuple[Degrees, ...], Arg(metavar="DEG")] = ()
-    """push that way, 0 forwards, 90 to the left; may be repeated (0, 45, 90, 135, 180)"""
+    """direction of the push: 0 forwards, 90 to the left; repeatable (default: 0, 45, 90, 135,
+    180)"""
     duration: tuple[Duration, ...] = ()
-    """duration of the pushes; may be repeated (0.3, 3)"""
+    """duration of the push; repeatable (default: 0.3, 3)"""
 
     def check(self) -> None:
-        """Refuse --out for a single point, which is many runs and has no log."""
+        """Refuse --out for a single point, which consists of many runs and has no log."""
         super().check()
         if self.only is not None and self.out is not None:
-            raise RunError("--only: a point is many runs and has no log; remove --out")
+            raise RunError("--only: a point consists of many runs and has no log; remove --out")
 
 
 def trials_of(flags: PushStudyFlags) -> list[PushTrial]:
@@ -220,7 +221,7 @@ def report(finished: StudyRun) -> None:
     """Print the largest withstood pushes by direction, and the part that gives way first."""
     rows = finished.rows
     angles = [f"{angle} deg" for angle in dict.fromkeys(row["angle_deg"] for row in rows)]
-    printed = Table(title="Largest push that it withstood, N", title_justify="left")
+    printed = Table(title="Largest push that the robot withstood, N", title_justify="left")
     for heading in ("pose", "s", "planner", *angles, "gives way"):
         printed.add_column(heading, no_wrap=True)
     groups: dict[tuple[str, float, str], list[Row]] = {}

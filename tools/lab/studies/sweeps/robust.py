@@ -1,4 +1,4 @@
-"""`xrl study robust`: draws every error of the plant at once, leads, pushes, kills, counts falls.
+"""`xrl study robust`: leads, pushes and kills robots on random plants, and counts falls.
 
 The seed and the number of a trial determine it.
 """
@@ -56,7 +56,7 @@ LEAN_SHARE: Final = (0.15, 0.4)
 LEAN_S: Final = 1.5
 """Duration of the long push while the planner leads, s."""
 PUSH_SHARE: Final = (0.3, 1.0)
-"""Fractions of the largest drawn push (`PushRange`)."""
+"""Range of the drawn pushes, as fractions of the largest one (`PushRange`)."""
 PUSH_S: Final = 0.3
 AFTER_KILL_S: Final = 2.5
 
@@ -195,23 +195,21 @@ xrl study robust --n 500 --out out/robust
 xrl study robust --beyond 2
 xrl study robust --slope 5 --imu
 xrl study robust --reacts 0.3
-xrl study robust --only 17 --out out/trial17
 """
 
 
 class RobustStudyFlags(StudyFlags, ImuFlags, PushFlags):
-    """Number of trials, and their distance from the file."""
+    """Number of trials, and the errors of their plants."""
 
     n: Count = 100
-    """trials"""
+    """number of trials"""
     beyond: Annotated[Number, Arg(metavar="F")] = 1.0
-    """widen every range of deploy/plants/ranges.toml about its middle by the factor F"""
+    """scale every range of deploy/plants/ranges.toml about its middle by F"""
     slope: Annotated[float, Range(0.0, SLOPE_MAX_DEG, "degrees"), Arg(metavar="DEG")] = 0.0
-    """use a floor that slopes by DEG degrees in a random direction (default: up to 1 degree, as in
-    the ranges)"""
+    """slope of the floor, in a random direction (default: up to 1 degree along x and y)"""
     reacts: Annotated[float | None, Range(0.0, 5.0, "s"), Arg(metavar="S")] = None
-    """the person stops leading S seconds after the robot went to HOLD, as warned by `xrl cue`
-    (default: the hand keeps leading)"""
+    """stop leading S seconds after the robot goes to HOLD, like a person whom `xrl cue` warns
+    (default: never)"""
 
     def check(self) -> None:
         """Refuse ranges that give impossible values."""
@@ -245,7 +243,7 @@ def report(finished: StudyRun) -> None:
     rows = finished.rows
     study.show_outcome(finished, FIGURES, lambda row: f"{row['kind']}: trial {row['number']}")
     if len(rows) < RANKED_LEAST:
-        most = f"{len(rows)} trials are too few to rank errors; needs at least {RANKED_LEAST}"
+        most = f"unknown; ranking needs at least {RANKED_LEAST} trials"
     else:
         most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
     finished.console.print(f"costs most of the margin (rank correlation): {most}", soft_wrap=True)

@@ -59,17 +59,16 @@ class StudyFlags(ConfigFlags):
     workers: Annotated[Count | None, Arg(metavar="N")] = None
     """processes on this machine (default: one per core)"""
     cluster: Annotated[str | None, Arg(metavar="ADDRESS")] = None
-    """run on the workers of a Dask scheduler instead, such as tcp://HOST:8786; each needs this
-    project installed, and one thread"""
+    """run on a Dask scheduler's workers, such as tcp://HOST:8786; each needs this project and one
+    thread"""
     out: Folder | None = None
-    """folder of the table and the picture (default: out/sweep-NAME-<time>); an interrupted study
-    resumes there"""
+    """folder for table and picture, in which an interrupted study resumes (default:
+    out/sweep-NAME-<time>)"""
     only: Annotated[Natural | None, Arg(metavar="NUMBER")] = None
-    """run only this case and print all of it; exit code 1 if it fell; with --out its log goes there
-    (default: none)"""
+    """run only this case and print it; --out stores its log, except for `study push`"""
 
     def check(self) -> None:
-        """Refuse contradictory places to run on."""
+        """Refuse contradictory flags about where to run."""
         super().check()
         if self.cluster is not None and self.workers is not None:
             raise RunError("--workers is for this machine, --cluster for others; remove one")
@@ -78,7 +77,7 @@ class StudyFlags(ConfigFlags):
 
 
 class StudyRun(NamedTuple):
-    """A running study; with its rows, the input of its report."""
+    """A running study; once it has its rows, the input of its report."""
 
     flags: Any
     robot: RobotConfig
@@ -103,7 +102,8 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     cases: Callable[[Any, RobotConfig], Callable[[int], C]]
     """Returns the function that draws the case with a number, independently of other draws."""
     decided_by: tuple[str, ...] = ()
-    """Flags that affect the rows, besides seed, robot and code; a folder with others is refused."""
+    """Flags that affect the rows, besides seed, robot and code; a folder with other values is
+    refused."""
     row: Callable[[Any], dict[str, object]] = scalars
     """The draws of a case by column, its number first."""
     figures: type[msgspec.Struct]
@@ -113,7 +113,7 @@ class Study(msgspec.Struct, Generic[C], frozen=True, kw_only=True):
     robots: Callable[[Sequence[C], RobotConfig, int, Console], Sequence[RobotConfig]] = (
         lambda cases, robot, _workers, _console: [robot] * len(cases)
     )
-    """Returns the robot of each case, prepared by a number of processes."""
+    """Returns the robot of each case, prepared in the given number of processes."""
     report: Callable[[StudyRun], None]
     """Prints the outcome."""
     draw: Callable[[StudyRun], Picture]
@@ -152,7 +152,8 @@ def run(study: Study[C], flags: Any) -> int:
                 many += [f"--cluster {flags.cluster}"] if flags.cluster else []
                 again = " ".join([begun.command, *many, f"--out {shlex.quote(str(out))}"])
                 begun.console.print(
-                    f"{done} cases are in {out}; resume with: {again}", soft_wrap=True
+                    f"{done} of {len(drawn)} cases are in {out}; resume with: {again}",
+                    soft_wrap=True,
                 )
             raise
         finished = begun._replace(rows=table.rows)
@@ -239,7 +240,7 @@ def _run_alone(study: Study[C], begun: StudyRun, case: C) -> int:
 def command_of(study: Study[Any], flags: Any) -> str:
     """Return the command of a study with the flags that differ from their defaults.
 
-    It does not contain `--only`, the number of cases, where they run, and `--out`.
+    It leaves out `--only`, the number of cases, where they run, and `--out`.
     """
     words = [f"xrl study {study.name} --seed {flags.seed}"]
     for field in fields_of(type(flags)):
@@ -319,7 +320,7 @@ def show_outcome(
     low, high = wilson(len(fallen), len(rows))
     colour = "red" if fallen else "green"
     text = (
-        f"[bold {colour}]{{}} falls of {{}}[/]; fraction of falls {{:.2f}} to {{:.2f}} % "
+        f"[bold {colour}]{{}} of {{}} fell[/]; fraction of falls {{:.2f}} to {{:.2f}} % "
         "(95 %, Wilson)"
     )
     console.print(marked(text, len(fallen), len(rows), 100 * low, 100 * high), highlight=False)

@@ -1,7 +1,7 @@
 """A study's table: one CSV row per case, in order; an interrupted study resumes.
 
-The file is replaced whole with each row. Beside it, `inputs.json` contains its parameters. A folder
-with other parameters is refused, and so is one to which another study is writing.
+Each new row rewrites the whole file. Beside it, `inputs.json` contains the study's parameters. A
+folder with other parameters is refused, and so is one to which another study is writing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shared.exceptions import RunError
 
 INPUTS_FILE: Final = "inputs.json"
 DECIMALS: Final = 9
-"""Decimals of a flag's number."""
+"""Maximum number of decimals of a flag's value."""
 Row: TypeAlias = Mapping[str, Any]
 """A case's draws as drawn, then its figures as in the table."""
 
@@ -37,7 +37,7 @@ class CaseTable:
         figures: type[msgspec.Struct],
         inputs: Mapping[str, str],
     ) -> None:
-        """Open a table, a new one or one to resume.
+        """Open a new table, or one to resume.
 
         A row begins with the draws of its case, the case's number first, and ends with its
         figures. `inputs` are parameters of all rows, by name.
@@ -130,8 +130,8 @@ class CaseTable:
         for name, value in inputs.items():
             if there.get(name) != value:
                 raise RunError(
-                    f"{folder}: contains a study with a different {name} "
-                    f"({str(there.get(name))[:20]}, now {value[:20]}); choose another --out"
+                    f"{folder}: contains a study with other parameters ({name} "
+                    f"{str(there.get(name))[:20]}, now {value[:20]}); choose another --out"
                 )
 
     def _read(self) -> dict[int, dict[str, str]]:
@@ -157,5 +157,5 @@ def _text(value: object) -> str:
 
 
 def plain(value: float) -> str:
-    """Return a number with up to 9 decimals and without an exponent."""
+    """Return a number as text, with up to 9 decimals and without an exponent."""
     return f"{value:.{DECIMALS}f}".rstrip("0").rstrip(".")

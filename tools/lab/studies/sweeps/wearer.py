@@ -48,7 +48,7 @@ AFTER_S: Final = 2.0
 UP_S: Final = 0.5
 """Time in which a resting person gets up, s."""
 SETTLED_S: Final = 0.5
-"""Time after the weight has come from which the carried force is measured, s."""
+"""Time from the full weight to the measurement of the carried force, s."""
 LIMP_N: Final = 200.0
 BUMPS: Final = 5
 
@@ -120,13 +120,13 @@ class _WearerResult(Ended, frozen=True, kw_only=True):
     """The figures of a trial; None where nothing was measured. `_park`: with park on."""
 
     carried_pct: float | None = None
-    """Carried fraction of the resting weight, after it has come."""
+    """Part of the resting weight that the robot carries."""
     carried_pct_park: float | None = None
     sinks_mm: float | None = None
     """Sinking during the act, from the height at its start."""
     sinks_mm_park: float | None = None
     hand_n: float | None = None
-    """Largest force of the hand along z: in a squat, or after the act."""
+    """Largest vertical force of the hand, in a squat or after the act."""
     hand_n_park: float | None = None
     held: bool = False
     """True if modules went to HOLD during the act."""
@@ -139,7 +139,7 @@ class WearerStudyFlags(StudyFlags):
     """Number of persons."""
 
     n: Count = 20
-    """persons of each kind"""
+    """number of persons of each kind"""
 
 
 EXAMPLES: Final = """
@@ -176,7 +176,7 @@ def draw(seed: int, number: int) -> _WearerTrial:
 def run_trial(
     trial: _WearerTrial, robot: RobotConfig, observer: Observer = NOBODY
 ) -> _WearerResult:
-    """Run a trial twice, with park off and on; the observer gets the second run."""
+    """Run a trial twice, with park off and on; the observer receives the second run."""
     found: dict[str, object] = {}
     endings = []
     for park, watches in ((False, NOBODY), (True, observer)):
@@ -230,9 +230,9 @@ def _opened(run: CaseRun) -> int:
 
 
 FIGURES: Final = (
-    ("carried_pct", "carries of the resting weight", "%", -1.0),
+    ("carried_pct", "carried part of the resting weight", "%", -1.0),
     ("sinks_mm", "sinks", "mm", 1.0),
-    ("hand_n", "hand, squat or after it", "N", 1.0),
+    ("hand_n", "hand, in a squat or after the act", "N", 1.0),
 )
 """Column, description, unit, and the sign of the worse direction."""
 
