@@ -126,7 +126,7 @@ VERBS: Final = (
         for name, about in (
             ("kill", "kill the planner in random poses, under random pushes"),
             ("robust", "simulate robots with random plant errors: which fall, and why"),
-            ("latency", "compare three controls over bad networks"),
+            ("latency", "compare three controllers over bad networks"),
             ("push", "find the largest withstood push, with the planner alive and dead"),
             ("wearer", "simulate wearers who squat, rest, let go or go limp, with park off and on"),
         )

@@ -108,7 +108,7 @@ class SimTruth(Message, frozen=True):
     """Support by the hoist: 1 hanging, 0 free."""
     fallen: bool
     real_time_factor: float
-    """Simulated time divided by wall time."""
+    """Simulated time divided by the fleet's clock time, which `--pace` slows."""
     late_s: float
     """Clock time that the simulation has skipped."""
     lean: Pair = (0.0, 0.0)

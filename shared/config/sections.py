@@ -254,7 +254,7 @@ class JointServiceConfig(Section, frozen=True):
     damp_k_d: LocalDamping
     damp_knee_stop: Angle
     hold_stiffens_theta: tuple[Literal["ankle", "knee", "hip"], ...]
-    """In HOLD every phi, and the theta of these, rises to its stand gains."""
+    """In HOLD the gains of every phi, and of theta in these modules, rise to the stand gains."""
     damp_sinks: tuple[Literal["ankle", "knee", "hip"], ...]
     """In DAMP the theta of these sinks, and every phi holds."""
     torque_rate_max: Annotated[float, Range(100.0, 1e6, "N m/s")]

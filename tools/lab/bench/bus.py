@@ -66,7 +66,7 @@ def _over_zenoh(process: str, folder: Path) -> End:
 
 
 def over_datagrams(_process: str, folder: Path) -> End:
-    """Join UNIX datagrams: the reader of each key has a socket in the folder, and drains it."""
+    """Connect by UNIX datagrams: the reader of each key drains its socket in the folder."""
 
     def publisher(key: str) -> Put:
         end = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -94,7 +94,7 @@ def over_datagrams(_process: str, folder: Path) -> End:
 
 
 def _over_zmq(_process: str, folder: Path) -> End:
-    """Join ZeroMQ: PUB and SUB over ipc, a socket for each key; CONFLATE keeps the newest."""
+    """Connect by ZeroMQ: PUB and SUB over ipc, a socket for each key; CONFLATE keeps the newest."""
     context = zmq.Context()
 
     def publisher(key: str) -> Put:
@@ -113,7 +113,7 @@ def _over_zmq(_process: str, folder: Path) -> End:
 
 
 def _over_iceoryx2(_process: str, folder: Path) -> End:
-    """Join iceoryx2: bytes in shared memory for each key, with a buffer of one sample."""
+    """Connect by iceoryx2: bytes in shared memory for each key, with a buffer of one sample."""
     iox2.set_log_level(iox2.LogLevel.Fatal)
     node = iox2.NodeBuilder.new().create(iox2.ServiceType.Ipc)
 

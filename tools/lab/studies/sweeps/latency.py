@@ -1,9 +1,9 @@
-"""`xrl study latency`: compares three controls over good and bad networks, under pushes.
+"""`xrl study latency`: compares three controllers over good and bad networks, under pushes.
 
 The fleet starts and is led over a good network. From a random time to the end, every link is
 impaired in both directions. That time, the pushes and the lost messages are random. They are the
-same for every delay and control, but differ between repeats, losses and jitters, so a control's
-trials at one delay are independent.
+same for every delay and controller, but differ between repeats, losses and jitters, so a
+controller's trials at one delay are independent.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Draw(NamedTuple):
 
 
 class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
-    """A trial of one control over one network."""
+    """A trial of one controller over one network."""
 
     number: int
     """Number of the row."""
@@ -127,7 +127,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def draw(self) -> Draw:
-        """The random draws, equal for every delay and control."""
+        """The random draws, equal for every delay and controller."""
         jitter, loss = plain(self.network.jitter_ms), plain(self.network.loss)
         dice = random.Random(f"latency {self.seed} {self.repeat} {jitter} {loss}")
         begin = uniform(dice, *IMPAIRED_FROM_S)
@@ -154,7 +154,7 @@ class LatencyTrial(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def true_plant(self) -> PlantConfig:
-        """Return the simulated robot, with random errors that are equal for each control."""
+        """Return the simulated robot, with random errors that are equal for each controller."""
         return plants.draw(f"latency {self.draw.fleet_seed}")
 
 
@@ -169,7 +169,7 @@ class _LatencyResult(Ended, frozen=True, kw_only=True):
     hold_share: float | None = None
     """Fraction of the time in which a module held, so the robot did not follow the hand.
 
-    Always 0 for the centralised control, which has no HOLD.
+    Always 0 for the centralised controller, which has no HOLD.
     """
     holds: int | None = None
     """Changes from TRACK to HOLD of the module with the most."""
@@ -193,7 +193,7 @@ def row_of(trial: LatencyTrial) -> dict[str, object]:
 
 
 def robot_of(robot: RobotConfig, control: str) -> RobotConfig:
-    """Return the robot with the gain split of a control."""
+    """Return the robot with the gain split of a controller."""
     split = CONTROLS[control].split
     if split is None:
         return robot
@@ -297,7 +297,7 @@ xrl study latency --cluster tcp://HOST:8786
 
 
 class LatencyStudyFlags(StudyFlags):
-    """Networks and controls to compare."""
+    """Networks and controllers to compare."""
 
     delay: Annotated[
         tuple[float, ...],
@@ -318,12 +318,12 @@ class LatencyStudyFlags(StudyFlags):
         ),
     ] = _SHARES(LOSSES)  # fmt: skip
     n: Count = 4
-    """trials per network and control"""
+    """trials per network and controller"""
     control: Annotated[
         tuple[str, ...],
         parsed(
             names_of(CONTROLS), "NAME,...", is_one=True,
-            help="controls to compare (default: all): "
+            help="controllers to compare (default: all): "
             + "; ".join(f"{name}: {control.about}" for name, control in CONTROLS.items()),
         ),
     ] = tuple(CONTROLS)  # fmt: skip
@@ -336,7 +336,7 @@ class LatencyStudyFlags(StudyFlags):
 
 
 def grid_of(flags: LatencyStudyFlags) -> list[tuple[Network, str]]:
-    """Return each network with each control."""
+    """Return each network with each controller."""
     networks = [Network(d, j, p) for p, j, d in product(flags.loss, flags.jitter, flags.delay)]
     return list(product(networks, flags.control))
 
@@ -353,7 +353,7 @@ def trial_of(grid: Sequence[tuple[Network, str]], seed: int, number: int) -> Lat
 
 
 class _Cell(NamedTuple):
-    """Trials of one control at one delay."""
+    """Trials of one controller at one delay."""
 
     fallen: int
     of: int
@@ -374,7 +374,7 @@ class _Cell(NamedTuple):
 
 
 def cells_of(rows: Sequence[Row]) -> dict[tuple[str, float], _Cell]:
-    """Return the trials by control and delay, in the order of `CONTROLS`."""
+    """Return the trials by controller and delay, in the order of `CONTROLS`."""
     cells = {}
     delays = sorted({float(row["delay_ms"]) for row in rows})
     for control, delay in product(CONTROLS, delays):
@@ -398,7 +398,7 @@ def mix(rows: Sequence[Row]) -> str:
 
 
 def report(finished: StudyRun) -> None:
-    """Print falls, hand and HOLD by delay, and the command for each control's first fall."""
+    """Print falls, hand and HOLD by delay, and the command for each controller's first fall."""
     rows, console = finished.rows, finished.console
     cells = cells_of(rows)
     names = list(dict.fromkeys(control for control, _ in cells))
