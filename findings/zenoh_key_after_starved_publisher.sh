@@ -3,11 +3,12 @@
 #
 # Guess: a sample's key is the publisher's key. A publisher that gets too little processor time may be
 # disconnected, so messages are late or lost, but they never arrive under another key.
-# Seen: on a link, keys are numbers. A starved publisher misses its lease, and the subscriber closes the link
-# and dials again. For a moment the publisher accepts the new link into the old transport. It then sends with
-# the old link's numbers, and the subscriber looks them up in the new link's table. The subscriber of another
-# key gets the message, and sample.key_expr names that other key. The transport is replaced soon after, so
-# the fault lasts only milliseconds. 12 publishers of 30 keys: 118 of 2.1 million messages in 80 s.
+# Seen: a starved publisher misses its lease, and the subscriber closes the link and dials again. Then the
+# subscriber of another key may get a message, and sample.key_expr names that other key. 12 publishers of
+# 30 keys: 118 of 2.1 million messages in 80 s, in short bursts.
+# Likely cause, from the source of 1.9.0: keys are numbers on a link. While the publisher closes the old
+# link, it can accept the new one into the old transport, and sends with the old link's numbers; the
+# subscriber looks them up in the new link's table.
 # An attachment that holds the publisher's key shows it; shared/bus/session.py attaches and compares it.
 #
 # The publishers are starved with SIGSTOP and SIGCONT, so no privileges are needed. Under real-time priorities

@@ -104,7 +104,7 @@ class RawPublisher(Publisher[bytes]):
     """Publisher of encoded payloads on one key: for log playback, never for a service."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
-        super().__init__(publisher, bytes, addressed(publisher))
+        super().__init__(publisher, bytes, put_with_key(publisher))
 
     @property
     def matched(self) -> bool:
@@ -121,7 +121,7 @@ class Latest(Generic[M]):
     def __init__(self, subscriber: Subscriber, message_type: type[M]) -> None:
         self._subscriber = subscriber  # dropping it would end the subscription
         self._try_recv = subscriber.handler.try_recv
-        self._address = _address(str(subscriber.key_expr))
+        self._attachment = _attachment(str(subscriber.key_expr))
         self._decoder = Decoder(message_type)
         self._misdelivered = 0
 
@@ -143,7 +143,7 @@ class Latest(Generic[M]):
         sample = self._try_recv()
         if sample is None:
             return None
-        if sample.attachment != self._address:
+        if sample.attachment != self._attachment:
             self._misdelivered += 1
             return None
         return sample.payload.to_bytes()
@@ -190,7 +190,7 @@ class Stream:
             if sample is None:
                 continue
             key = str(sample.key_expr)
-            if sample.attachment == _address(key):
+            if sample.attachment == _attachment(key):
                 return key, sample.payload.to_bytes(), now_ns()
             self.misdelivered += 1
         return None
@@ -226,7 +226,7 @@ class Recording(Stream):
         return *self._waiting.popleft(), now_ns()
 
 
-def _address(key: str) -> zenoh.ZBytes:
+def _attachment(key: str) -> zenoh.ZBytes:
     """Return the attachment of every message: the key that it was sent to.
 
     Zenoh 1.10.2 may deliver a message under another key. A process without CPU time for longer
@@ -236,6 +236,6 @@ def _address(key: str) -> zenoh.ZBytes:
     return zenoh.ZBytes(key.encode())
 
 
-def addressed(publisher: zenoh.Publisher) -> _Put:
+def put_with_key(publisher: zenoh.Publisher) -> _Put:
     """Return the `put` that attaches the publisher's key."""
-    return partial(publisher.put, attachment=_address(str(publisher.key_expr)))
+    return partial(publisher.put, attachment=_attachment(str(publisher.key_expr)))

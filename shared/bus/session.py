@@ -34,7 +34,7 @@ from shared.bus.pubsub import (
     Recording,
     Stream,
     Subscriber,
-    addressed,
+    put_with_key,
 )
 from shared.bus.security import alive_prefix, token_key, tools_prefix
 from shared.bus.topics import Priority, Topic
@@ -173,12 +173,14 @@ class Session:
         """
         key = self._key(topic, message_type, module)
         publisher = self._declare(topic, key)
-        put = addressed(publisher)
+        put = put_with_key(publisher)
         if topic.batch is None:
             return Publisher(publisher, encode, put)
         batch_key = topic.batch.key(self.robot, module)
         if batch_key not in self._batches:
-            self._batches[batch_key] = BatchSender(addressed(self._declare(topic.batch, batch_key)))
+            self._batches[batch_key] = BatchSender(
+                put_with_key(self._declare(topic.batch, batch_key))
+            )
         batch = self._batches[batch_key]
         return Publisher(publisher, encode, batch.also(key, put, closes=topic.closes))
 

@@ -78,6 +78,17 @@ def test_what_came_is_in_the_file_within_the_flush_period(tmp_path: Path) -> Non
     assert seqs(tmp_path / "run.mcap") == list(range(run.sent))
 
 
+def test_messages_under_another_key_are_in_the_recorders_counts(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    run = rig(tmp_path)
+    run.queue.misdelivered = 4
+    run.run(10.1)
+    run.finish()
+    assert "; 4 left out, delivered under another key" in caplog.text
+
+
 def test_it_splits_by_time_and_loses_nothing(tmp_path: Path) -> None:
     run = rig(tmp_path, split_s=2.0)
     run.run(7.0)

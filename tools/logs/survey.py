@@ -115,9 +115,6 @@ class Survey:
                 facts.counted = reader.message_count
             if taken:
                 break
-        if not facts.ours:  # other writers number messages as they like; rosbags writes only 0
-            for topic in self.topics.values():
-                topic.sequence = KeyCount(count=topic.sequence.count, several=True)
         self.files.append(facts)
         return facts
 
@@ -137,6 +134,11 @@ class _Reading:
                 self._take(value)
             if record.rows:
                 self._count(record)
+        if (
+            not self._facts.ours
+        ):  # other writers number messages as they like; rosbags writes only 0
+            for topic in self._channels.values():
+                topic.sequence = KeyCount(count=topic.sequence.count, several=True)
         return True
 
     def skim(self, reader: LogReader) -> bool:
