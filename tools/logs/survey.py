@@ -134,9 +134,8 @@ class _Reading:
                 self._take(value)
             if record.rows:
                 self._count(record)
-        if (
-            not self._facts.ours
-        ):  # other writers number messages as they like; rosbags writes only 0
+        if not self._facts.ours:
+            # Other writers number messages as they like; rosbags writes only 0.
             for topic in self._channels.values():
                 topic.sequence = KeyCount(count=topic.sequence.count, several=True)
         return True
