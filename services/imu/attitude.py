@@ -19,6 +19,7 @@ from shared.can.sensor_frames import ImuSample
 from shared.clock import NS_PER_MS
 from shared.config.sections import ImuConfig
 from shared.robot.frames import rotated, torso_rotation
+from shared.rounding import DECIMALS
 
 UNIT_TOLERANCE: Final = 0.02
 """Maximum deviation of a quaternion's length from 1; rounding to 2^-15 causes 6e-5."""
@@ -69,8 +70,8 @@ class AttitudeLaw:
                 self._newest, self._changed_ns = sample, now_ns
             self._knows = sample.valid
             if sample.valid:
-                self._up = rotated(self._mounting, up_in_sensor(sample.quaternion))
-                self._rate = rotated(self._mounting, sample.rate)
+                self._up = _rounded(rotated(self._mounting, up_in_sensor(sample.quaternion)))
+                self._rate = _rounded(rotated(self._mounting, sample.rate))
         if self._sample_ns is None:
             return AttitudeReading(self._up, self._rate, valid=False, age_ns=-1)
         age_ns = now_ns - self._sample_ns
@@ -85,6 +86,11 @@ def up_in_sensor(quaternion: Vector4) -> Vector3:
     up = (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z)
     length = math.hypot(*up)
     return (up[0] / length, up[1] / length, up[2] / length)
+
+
+def _rounded(vector: Vector3) -> Vector3:
+    x, y, z = vector
+    return round(x, DECIMALS), round(y, DECIMALS), round(z, DECIMALS)
 
 
 def _is_unit(quaternion: Vector4) -> bool:

@@ -12,9 +12,9 @@ After an emergency stop the knees sink, and each module must react to the others
   Beside an ankle or hip whose drive kept holding, it fell in 28 of 40 stops. So a knee stops
   sinking if another module does not go down.
 
-If a module is limp, others stiffen, in HOLD and in DAMP (`shared.robot.hold_rules`). Without that,
-the robot fell within 1.3 s after a knee went limp with the planner dead, and within 2 s after an
-emergency stop with a limp knee. A drive that loses power only falls silent. When the others
+If a knee or ankle is limp, others stiffen, in HOLD and in DAMP (`shared.robot.hold_rules`). Without
+that, the robot fell within 1.3 s after a knee went limp with the planner dead, and within 2 s after
+an emergency stop with a limp knee. A drive that loses power only falls silent. When the others
 stiffened only after 100 ms, at DRIVE_LOST, the robot fell in 3 of 4 squats.
 
 All this must work without planner and bus. So in each cycle each service stores its row in a file
@@ -114,7 +114,7 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
     if kind == "hip":
         ankle, knee = _fresh(rows[own - 2], now_ns), _fresh(rows[own - 1], now_ns)
         if ankle is not None and knee is not None:
-            leg = (ankle.theta + knee.theta, ankle.rate + knee.rate)
+            leg = rounded((ankle.theta + knee.theta, ankle.rate + knee.rate))
     elif kind == "ankle":
         knee = _fresh(rows[own + 1], now_ns)
         if knee is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -46,6 +46,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_MODULES
 from shared.robot.hold_rules import Support
+from shared.rounding import DECIMALS, rounded
 
 EARLY_FRACTION = 0.5
 """Fraction of a period; states that arrive sooner after a tick still belong to that tick."""
@@ -54,9 +55,6 @@ LATE_FRACTION = 1.25
 TICK_GAP_MAX_S = 0.02
 """Maximum integration step, s; a longer gap between ticks means a stopped process."""
 
-_DECIMALS: Final = 7
-"""Decimals of lengths, angles, rates, torques and gains in messages, SI units. No sensor or motor
-resolves 1e-7, and a double's further digits would fill a sixth of the log."""
 _ALL_NEW = (1 << N_MODULES) - 1
 # Constants, because each tick compares them (docs/contributing.md, The control path).
 _CARRIES = (int(Mode.HOLD), int(Mode.TRACK))
@@ -433,6 +431,7 @@ class Planner:
     def _commands(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
         """Return the tick's six commands; each echoes the stamp of its module's state."""
         s, local, hold = self.state, output.local, self._hold()
+        margin, margin_onboard = rounded(local.margins)
         arrays = (
             output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
             local.D, local.D_B,
@@ -453,8 +452,8 @@ class Planner:
                 tau_coupled=tau_coupled,
                 k_p=k_p,
                 k_d=k_d,
-                margin=local.margins.service,
-                margin_onboard=local.margins.onboard,
+                margin=margin,
+                margin_onboard=margin_onboard,
                 stiffen=s.support.includes(module),
                 state_phase=phase,
                 fallen=s.fall.fell_ns > 0,
@@ -524,11 +523,13 @@ class Planner:
             for state, arrived in zip(s.states, s.arrived_ns, strict=True)
         ]
         leads = not s.engagement.hold
+        carried_n = GRAVITY * (self._payload + load.kg) - (s.heat.lifted or 0.0)
+        margin = margin_onboard = 0.0
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
-            vectors = output.p, output.pdot, output.p_ref, output.closure
-            p, pdot, p_ref, closure = map(vector6, _rounded(vectors))
-            stance = output.stance
+            vectors = output.p, output.pdot, output.p_ref, output.closure, np.array(output.stance)
+            p, pdot, p_ref, closure, stance = map(vector6, _rounded(vectors))
+            margin, margin_onboard = rounded(output.local.margins)
         return PlannerStatus(
             t_ns=now_ns,
             seq=s.seq,
@@ -540,8 +541,8 @@ class Planner:
             p_ref=p_ref,
             closure=closure,
             assist_n=output.assist if output is not None else 0.0,
-            margin=output.local.margins.service if output is not None else 0.0,
-            margin_onboard=output.local.margins.onboard if output is not None else 0.0,
+            margin=margin,
+            margin_onboard=margin_onboard,
             split=int(output.local.source) if output is not None else int(SplitSource.DIAGONAL),
             ik_iterations=output.ik_iterations if output is not None else 0,
             ik_residual=output.ik_residual if output is not None else 0.0,
@@ -554,7 +555,7 @@ class Planner:
             attitude_seq=-1 if s.attitude is None else s.attitude.seq,
             slope=output.slope if output is not None else (0.0, 0.0),
             shift_requested=s.request.shift,
-            load=(load.kg, load.a, load.b),
+            load=(round(load.kg, DECIMALS), *rounded((load.a, load.b))),
             requested_by=s.request.source,
             stance=stance,
             why=self._why(),
@@ -566,11 +567,11 @@ class Planner:
             supply_v=s.supply.volts,
             wearer=int(s.park.reported(now_ns)) if self._park.enabled else 0,
             park_requested=int(s.request.park),
-            carried_n=GRAVITY * (self._payload + load.kg) - (s.heat.lifted or 0.0),
+            carried_n=round(carried_n, DECIMALS),
         )
 
 
 def _rounded(vectors: Sequence[Array]) -> Array:
-    """Return the vectors as rows, rounded to what a sensor or a motor could resolve."""
-    rows: Array = np.concatenate(vectors).round(_DECIMALS).reshape(len(vectors), -1)
+    """Return the vectors as rows, rounded to `DECIMALS`."""
+    rows: Array = np.concatenate(vectors).round(DECIMALS).reshape(len(vectors), -1)
     return rows

@@ -110,7 +110,7 @@ def place_of_tool() -> str:
     return f"{re.sub('[^A-Za-z0-9-]', '-', socket.gethostname())}.{os.getpid()}"
 
 
-class LinkedTools:
+class _LinkedTools:
     """Tools linked with this process."""
 
     def __init__(self, subscriber: Subscriber) -> None:
@@ -259,10 +259,10 @@ class Session:
             if reply.ok is not None
         }
 
-    def linked_tools(self) -> LinkedTools:
+    def linked_tools(self) -> _LinkedTools:
         """Declare a watch on the tools that are linked with this process."""
         watched = f"{tools_prefix(self.robot)}/*"
-        return LinkedTools(
+        return _LinkedTools(
             self._session.liveliness().declare_subscriber(
                 watched, zenoh.handlers.RingChannel(_TOOLS_WAITING), history=True
             )

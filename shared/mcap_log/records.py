@@ -49,8 +49,9 @@ CHUNK_TIMES: Final = struct.Struct("<QQQI")
 CRC: Final = struct.Struct("<I")
 
 ZSTD_LEVEL: Final = 1
-"""JSON rows with measured doubles are smaller at level 1 than at any level up to 12. At the default
-level 3 a run is 6 % larger and takes twice the time (findings/zstd_level_of_json_rows.sh)."""
+"""At level 1, JSON rows of measurements are smaller than at the default level 3, ours by 8 %, and
+take less time (findings/zstd_level_of_json_rows.sh). Level 9 saves 8 % more,
+in four times the time."""
 DECOMPRESSED_MAX: Final = 1 << 26
 """Maximum decompressed size of a chunk, bytes, unless its compressed size allows more: a flipped
 bit can claim exabytes."""

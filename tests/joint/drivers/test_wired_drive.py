@@ -110,7 +110,7 @@ def test_a_motor_that_counts_down_is_the_same_joint(pos: Pair, signs: tuple[int,
     assert target == (signs[0] * (pos[0] + MARK), signs[1] * (pos[1] + MARK))
     inner.reading = at(target)  # type: ignore[arg-type]
     vel, torque = (signs[0] * 0.5, signs[1] * -0.5), (signs[0] * 0.1, signs[1] * 0.2)
-    expected = DriveReading(7, pytest.approx(pos), vel, DriveStatus.ARMED, 0x40, torque)
+    expected = DriveReading(7, pytest.approx(pos, abs=1e-6), vel, DriveStatus.ARMED, 0x40, torque)
     assert drive.read(0.0) == expected
     drive.write(TARGET)
     drive.write_torque((0.1, 0.2))

@@ -23,6 +23,7 @@ from shared.config.scenarios import Fault, Kill, Restart
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.joints import MODULES
 from shared.mcap_log import provenance
+from shared.rounding import DECIMALS
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tests.shared.mcap_log.runs import recorded_in_parts, state
@@ -158,11 +159,11 @@ def test_the_planner_of_the_record_knew_the_slope(log: RunLog) -> None:
     assert log.messages(topics.PLANNER_STATUS)[-1].slope == pytest.approx((0.03, -0.02), abs=0.02)
 
 
-def test_one_bit_in_one_recorded_command_is_found_where_it_was_taken(log: RunLog) -> None:
+def test_the_last_digit_of_one_recorded_number_is_found_where_it_was_taken(log: RunLog) -> None:
     commands = log.messages(topics.JOINT_COMMAND, "hip_left")
     old = commands[len(commands) // 2]
     a, b = old.q_ref
-    new = msgspec.structs.replace(old, q_ref=(a, b + 2.3e-16 * max(1.0, abs(b))))
+    new = msgspec.structs.replace(old, q_ref=(a, b + 10.0**-DECIMALS))
     bent = edited(log, topics.JOINT_COMMAND, "hip_left", lambda row: new if row is old else row)
     first = executed(bent, "hip_left").comparison.first
     assert first is not None
