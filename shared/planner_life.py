@@ -113,6 +113,6 @@ def if_possible(end: Callable[[Path], End], run_dir: Path) -> End | None:
         return end(run_dir)
     except FleetError as error:
         log.get("xrl").warning(
-            "%s; the end of a planner will show only from the age of its commands", error
+            "%s; a dead planner will be noticed only by the age of its commands", error
         )
         return None

@@ -35,6 +35,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import LOST_S
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
 from shared.robot.hold_rules import SUPPORT_FOR
+from shared.rounding import rounded
 from shared.run_directory import live_dir, mapped
 
 STALE_NS: Final = 20 * NS_PER_MS

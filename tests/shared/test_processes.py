@@ -215,7 +215,7 @@ def test_each_service_hears_once_of_a_killed_process_and_does_without_shared_mem
     path_of(short_dir / "other").mkdir(parents=True)  # in the way
     for end in (OwnLife, PlannerLife):
         assert if_possible(end, short_dir / "other") is None
-    words = "the end of a planner will show only from the age of its commands"
+    words = "a dead planner will be noticed only by the age of its commands"
     assert caplog.text.count(words) == 2
 
 

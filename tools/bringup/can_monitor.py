@@ -369,7 +369,16 @@ def _axis_rows(
     if traffic.version is not None:
         found = describe_firmware(traffic.version.firmware)
         fix = "settings of firmware 0.6 cannot be read here: check them in its web GUI"
-        return [warning(subject, "firmware", found, "0.5.6", fix, "settings and errors differ")]
+        return [
+            warning(
+                subject,
+                "firmware",
+                found,
+                "0.5.6",
+                fix,
+                "its settings and error codes differ from those of 0.5.6",
+            )
+        ]
     drive = robot.drive
     # `errors` includes the flags of the heartbeat, because `axis_error` alone can stay 0.
     errors = traffic.heartbeat.errors & ~AxisError.WATCHDOG_TIMER_EXPIRED

@@ -252,7 +252,7 @@ def _split_name(module: str, name: str) -> tuple[str, str]:
 
 
 def alike_rows(boards: Boards) -> list[Finding]:
-    """Compare boards: settings in which few differ from most, motor data, and supply voltages."""
+    """Compare boards: settings in which a few boards differ, motor data, and supply voltages."""
     if len(boards) < BOARDS_MIN:
         return []
     names = dict.fromkeys(name for values in boards.values() for name in values)

@@ -159,7 +159,9 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
     """
     motion, felt = _read(log, robot)
     if motion is None or felt is None:
-        raise RunError(f"{log.path}: lacks data of harness, planner or joints, or was never led")
+        raise RunError(
+            f"{log.path}: has no data from harness, planner or joints, or the planner never led"
+        )
     led, phase = motion.led, motion.phase
     still = led & motion.still
     rests = _eroded(still, round(LEADS_FROM_S / GRID_S))

@@ -127,7 +127,7 @@ class _RecordedFile:
             self.finished = reader.finished
             """True if the recorder wrote the end of the file."""
             self.cut = reader.cut
-            """Rest after the last whole record of a file that was cut off."""
+            """Bytes after the last whole record, if the file was cut off; else None."""
             self.damage += reader.damage
 
     def required(self, record: str, field: str) -> str:

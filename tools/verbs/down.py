@@ -64,7 +64,7 @@ def run(flags: DownFlags) -> int:
 
 
 def _lower(fleet: SupervisedFleet, flags: DownFlags) -> None:
-    """Lower the robot if a service in this run directory holds one of its drives."""
+    """Lower the robot if its joint services run here; a simulated one only if a flag says so."""
     running = procfs.service_pids(fleet.run.path)
     simulated = "simulator" in running
     if not {*running} & {*MODULES} or (simulated and not (flags.sit or flags.lower_only)):

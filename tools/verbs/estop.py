@@ -156,7 +156,7 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
 def _conclude(going: list[str], which: str) -> None:
     refuse_going(going)
     Console().print(
-        f"{which} are stopped (DAMP). The robot sinks slowly; modules beside a limp or dead "
+        f"stopped (DAMP): {which}. The robot sinks slowly; modules beside a limp or dead "
         "module hold. To end the stop, run `xrl rearm` or `xrl down`"
     )
 

@@ -108,7 +108,7 @@ def pack(flags: PackFlags) -> int:
         return 0
     write_atomically(flags.out, to_tar(files), private=True)
     folder = Path(filled(robot.bus.security.keys, {ROBOT: robot.name})).parent
-    print(f"{flags.out}: {_count(names)}; on that host, run:")
+    print(f"{flags.out}: {_count(names)}; copy it to the host that it is for, and run there:")
     print(f"mkdir -p {folder} && tar -xf {flags.out.name} -C {folder}")
     return 0
 

@@ -183,7 +183,7 @@ class _Leader:
 
 
 def _by_pad(pad: Gamepad, leader: _Leader, console: Console) -> Key | None:
-    """Lead with a gamepad until it ends; return STOP after the emergency stop."""
+    """Lead with a gamepad until a stop, a signal or the loss of the pad; return STOP if stopped."""
     console.print(f"{pad.name}: hold the dead man's button and move the sticks; Ctrl-C quits")
     settling = time.monotonic() + SETTLE_S
     stop = StopFlag()

@@ -377,9 +377,9 @@ def _angle_rates_from_omega(roll: ca.SX, yaw: ca.SX) -> ca.SX:
 def _rotation_vector(rotation: ca.SX) -> ca.SX:
     """Return the rotation vector of a small rotation.
 
-    While the planner is engaged the legs disagree by far less than 0.2 rad. The series of asin(s)/s
-    is then accurate to 1e-9 and, unlike the quotient, regular at zero. At 0.34 rad it is accurate
-    to 2e-6.
+    While the planner is engaged, the legs disagree by far less than 0.2 rad. Up to there, the
+    series of asin(s)/s is accurate to 2e-8 and, unlike the quotient, regular at zero. At 0.34 rad
+    it is accurate to 2e-6.
     """
     axis = 0.5 * ca.vertcat(
         rotation[2, 1] - rotation[1, 2],

@@ -100,7 +100,7 @@ def test_settings_are_written_after_a_backup_of_all_and_kept(run_dir: Path, tmp_
     write_backup(file, [board], time="", robot_file="")
     result = verb(run_dir, tmp_path / "b", "--restore", str(file), "--apply")
     assert result.returncode == 0, result.stdout + result.stderr
-    assert "1 settings written" in result.stdout
+    assert "settings written: 1;" in result.stdout
     assert f"unzeroed by the restart: {MODULE}; run `xrl drive zero`" in result.stdout
     (kept,) = (tmp_path / "b").glob("*.json")
     (before,) = read_backup(kept).boards

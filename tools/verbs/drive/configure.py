@@ -306,7 +306,7 @@ def _conclude(console: Console, robot: RobotConfig, outcomes: Sequence[ChangeRes
             marked("[bold red]not as wanted[/]: {} {}: {}", change.module, change.name, what)
         )
     done = len(outcomes) - len(bad)
-    console.print(f"{done} settings written, saved, and read back after the restart")
+    console.print(f"settings written: {done}; saved, and read back after the restart")
     if done and robot.drive.zero_mark_turns > 0.0:
         written = (outcome.change for outcome in outcomes if not outcome.change.inhibit)
         restarted = dict.fromkeys(change.module for change in written)

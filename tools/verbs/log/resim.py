@@ -82,8 +82,8 @@ def run(flags: ResimFlags) -> int:
         _tell_reason(index, console)
     if not any(outcome.ticks for outcome in outcomes):
         raise RunError(
-            f"{flags.log}: nothing could be executed: the log has no checkpoint of these services; "
-            "record a run of over a second with this version"
+            f"{flags.log}: nothing could be executed: the log has no checkpoint or snapshot of "
+            "these services; record a run of over a second with this version"
         )
     if flags.param:
         return 0

@@ -232,7 +232,7 @@ def reachable(robot: RobotConfig, height: float, pitch: float) -> bool:
 def _way(
     robot: RobotConfig, poses: Sequence[tuple[float, float, float]], pace: float
 ) -> tuple[Keyframe, ...]:
-    """Return the way from standing to each pose of height, pitch and assist."""
+    """Return a path from standing through the poses (height, pitch, assist), in order."""
     way = [Keyframe(at=START_S, height=robot.simulation.stand_height)]
     for pose in poses:
         last = way[-1]

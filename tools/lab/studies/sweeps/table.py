@@ -130,7 +130,7 @@ class CaseTable:
         for name, value in inputs.items():
             if there.get(name) != value:
                 raise RunError(
-                    f"{folder}: contains a study with other parameters ({name} "
+                    f"{folder}: contains a study with different parameters ({name} "
                     f"{str(there.get(name))[:20]}, now {value[:20]}); choose another --out"
                 )
 
@@ -141,7 +141,9 @@ class CaseTable:
             table = csv.DictReader(file)
             try:
                 if table.fieldnames != self._columns:
-                    raise RunError(f"{self._path}: has other columns; choose another --out")
+                    raise RunError(
+                        f"{self._path}: its columns are not this study's; choose another --out"
+                    )
                 rows = {int(row[self._columns[0]]): row for row in table}
                 for row in rows.values():
                     self._typed(row)

@@ -219,7 +219,7 @@ def _hand(rows: Sequence[SimTruth]) -> float | None:
 
 
 def _opened(run: CaseRun) -> int:
-    """Return how often a parked robot was opened again after the first bump."""
+    """Return how often the robot unparked, counted from the start of the first bump."""
     begin_ns = next(row.t_ns for row in run.rows if row.scenario_s >= ACTS_S + 1.0)
     seen = [
         row.wearer == Wearing.LEADS

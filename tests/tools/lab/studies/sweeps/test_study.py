@@ -44,7 +44,7 @@ def test_the_same_seed_gives_the_same_table_resumed_and_with_any_number_of_worke
     assert (a / "toy.csv").read_bytes() == (b / "toy.csv").read_bytes()
     assert [row["ending"] for row in rows_of(b / "toy.csv")].count("fell") == 1
     assert (b / "toy.png").exists()
-    with pytest.raises(RunError, match=r"contains a study with other parameters \(seed"):
+    with pytest.raises(RunError, match=r"contains a study with different parameters \(seed"):
         toy(seed=6, out=a)
 
 
@@ -305,7 +305,7 @@ def test_a_folder_of_other_inputs_is_refused(tmp_path: Path) -> None:
     filled(tmp_path, 1)
     with pytest.raises(RunError, match=r"\(seed 1, now 2\); choose another --out"):
         table_in(tmp_path, inputs=INPUTS | {"seed": "2"})
-    with pytest.raises(RunError, match="other columns"):
+    with pytest.raises(RunError, match="its columns are not this"):
         table_in(tmp_path, [{"number": 1, "drawn": 0.5, "more": 1}])
 
 
