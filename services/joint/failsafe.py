@@ -168,7 +168,7 @@ class Failsafe(msgspec.Struct):
     planner_ended: bool = False
     """True after the end of the followed planner's process, until the cycle that acts on it."""
     fallen_since_ns: int = -1
-    """Time since which the planner has reported a fall, ns; -1 if it does not."""
+    """Time from which the planner reports a fall, ns; -1 if it does not."""
     limp: bool = False
     """True if the robot has fallen: in DAMP, this module then only damps."""
 

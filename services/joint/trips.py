@@ -75,9 +75,9 @@ class JointTrips(msgspec.Struct):
     mean: Pair = (0.0, 0.0)
     """Mean square of the rest, (N m)^2."""
     at_limit_ns: int = 0
-    """Time since which the torque is at its limit, ns; 0 if it is not."""
+    """Time from which the torque is at its limit, ns; 0 if it is not."""
     fast_ns: int = 0
-    """Time since which the joint turns too fast, ns; 0 if it does not."""
+    """Time from which the joint turns too fast, ns; 0 if it does not."""
 
     def reset(self, tau: Pair) -> None:
         """Restart from the drive's torque, N m, because only a module in TRACK trips."""

@@ -154,7 +154,8 @@ class UnixCanBus(can.BusABC):
         """
         if not self.send_packet(pack_frame(_can_id(msg), msg.dlc, bytes(msg.data))):
             raise can.CanOperationError(
-                f"{self.channel_info}: {os.strerror(errno.ENOBUFS)}", errno.ENOBUFS
+                f"{self.channel_info}: not sent: queue full (ENOBUFS), or the simulator has ended",
+                errno.ENOBUFS,
             )
 
     def send_packet(self, packet: bytes) -> int:
@@ -191,7 +192,7 @@ class UnixCanBus(can.BusABC):
         return packet
 
     def carried(self) -> bytes:
-        """Return own frames that the bus has carried since the last call.
+        """Return our frames that the bus has carried since the last call.
 
         Empty without `receive_own_messages`.
         """

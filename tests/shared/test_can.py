@@ -258,7 +258,7 @@ def test_a_send_queue_holds_as_many_frames_as_the_interface_and_refuses_more(
         fill(bus, TXQUEUELEN)
         assert bus.dropped == 0
         hub.poll()
-        with pytest.raises(can.CanOperationError, match="No buffer space") as raised:
+        with pytest.raises(can.CanOperationError, match="queue full") as raised:
             bus.send(message(1, b""))
         assert raised.value.error_code == errno.ENOBUFS
         hub.acknowledged = True

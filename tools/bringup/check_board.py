@@ -213,7 +213,7 @@ def describe_flags(kind: type[IntFlag], bits: int) -> str:
 def _temperature(subject: str, celsius: float) -> Finding:
     low, high = TEMPERATURES
     fix = "let the board cool; if the reading stays, the thermistor is broken: replace the board"
-    why = "from 100 C on the drive reduces its current, and at 120 C it disarms"
+    why = "from 100 C on the drive reduces its current, and at 125 C it disarms"
     good, found = low <= celsius <= high, f"{celsius:.0f} C"  # NaN is not good
     return advised(good, subject, "temperature", found, f"{low:g} to {high:g} C", fix, why)
 

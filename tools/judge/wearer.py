@@ -78,7 +78,7 @@ class WearerFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a run, or of a part of it."""
 
     phases: dict[str, _Phase]
-    """By `PHASES`, and `all`, without those that did not occur."""
+    """Figures of each phase that occurred (`PHASES`), and of `all`."""
     work_j: float
     force_rms_n: float
     """Root mean square of the force on the person, all directions."""

@@ -207,7 +207,9 @@ class Descent:
         silent = [name for name, state in zip(MODULES, states, strict=True) if state is None]
         if silent:
             if self._for_s(now_s) > HEARD_S:
-                raise FleetError(f"{', '.join(silent)}: silent; the robot may bear weight; {WAYS}")
+                raise FleetError(
+                    f"{', '.join(silent)}: silent, so the robot may still stand on its legs; {WAYS}"
+                )
             return Ask.NOTHING
         if self._for_s(now_s) < LIGHT_S or self._light_s is not None:
             return Ask.NOTHING

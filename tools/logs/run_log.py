@@ -372,7 +372,7 @@ def text_of(log: RunLog | RunIndex, name: str) -> str:
     try:
         return decoded(log.attachments[name])
     except KeyError:
-        raise RunError(f"{log.path}: has no {name}; must be a run of this project") from None
+        raise RunError(f"{log.path}: has no {name}; give a log that XRL recorded") from None
     except UnicodeError as error:
         raise RunError(f"{log.path}: its {name} {error}") from None
 

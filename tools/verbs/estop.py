@@ -74,7 +74,7 @@ class EstopFlags(Flags):
 
 
 def estop(flags: EstopFlags) -> int:
-    """Repeat the stop until every module has stopped; a module leaves DAMP only by a restart."""
+    """Request the stop, and wait until every module has stopped, or report those that have not."""
     run_dir = flags.run_dir
     is_here = _is_here(flags)
     if flags.wait:

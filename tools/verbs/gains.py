@@ -89,7 +89,9 @@ def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None
     if damping_of is not None:
         other = gain_schedule.read(damping_of)
         if other is None:
-            raise ConfigError(str(damping_of), "(file)", "not found", "a schedule from `xrl gains`")
+            raise ConfigError(
+                str(damping_of), "(file)", "not found", "give a schedule from `xrl gains`"
+            )
         design = split_program.design_of(other)
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),

@@ -29,7 +29,7 @@ xrl new lab                     # then: cd lab; every verb finds robot.toml ther
 
 
 class NewFlags(Flags):
-    """Directory to create."""
+    """Directory for a robot."""
 
     directory: Annotated[Path, positional("DIR")]
     """new or empty directory"""

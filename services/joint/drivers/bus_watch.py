@@ -1,4 +1,4 @@
-"""State of a CAN bus: whether the drive sends, and whether own frames are carried. Pure.
+"""State of a CAN bus: whether the drive sends, and whether our frames are carried. Pure.
 
 A CAN controller repeats a frame until a node acknowledges it: the bus has then carried the frame.
 If no node has power, the controller repeats it endlessly. Later frames wait behind it in the
@@ -6,10 +6,10 @@ adapter, the interface's queue and the socket, and all reach the drive when its 
 kernel drops no frame because of its age. So the link sends no frame that might have to wait:
 
 - it sends only probes and first requests unless the drive has sent a frame within `QUIET_MS`;
-- it sends nothing while an own frame has had no echo for `STUCK_MS` (CAN_RAW_RECV_OWN_MSGS: the
-  echo shows that the bus has carried it);
+- it sends nothing while one of our frames has had no echo for `STUCK_MS` (CAN_RAW_RECV_OWN_MSGS:
+  the echo shows that the bus has carried it);
 - it restarts the interface to discard frames without an echo for `RESTART_MS`;
-- it requests arming only if the bus has carried an own frame within `PROOF_MS`.
+- it requests arming only if the bus has carried one of our frames within `PROOF_MS`.
 
 After an outage, one harmless frame, the probe, must be carried before anything else is sent.
 """
@@ -24,17 +24,17 @@ from shared.clock import NS_PER_MS
 QUIET_MS: Final = 20
 """Silence of the drive after which only probes are sent, ms: ten encoder frames at 500 Hz."""
 STUCK_MS: Final = 15
-"""Time within which any live bus carries an own frame, ms: a queue of 100 frames takes 13 ms."""
+"""Time within which any live bus carries a frame of ours, ms: a queue of 100 frames takes 13 ms."""
 RESTART_MS: Final = 30
 """Age at which frames that were not carried are discarded, ms: with a cycle of 5 ms and the restart
 itself, none becomes 50 ms old."""
 ASK_AFTER_NS: Final = 4 * NS_PER_MS
-"""Age of an own frame above which the link queries `xrl_unix` for carried frames, ns; each query is
-a system call."""
+"""Age of a frame of ours above which the link queries `xrl_unix` for carried frames, ns; each query
+is a system call."""
 PROOF_MS: Final = 50
-"""Maximum time since the bus carried an own frame, for an arming request, ms."""
+"""Maximum time since the bus carried one of our frames, for an arming request, ms."""
 PROBE_MS: Final = 100
-"""Period of probes on a bus that carries no own frame although the drive sends, ms."""
+"""Period of probes on a bus that carries none of our frames although the drive sends, ms."""
 BLOCKED_MS: Final = 100
 """Time without a carried frame, since one was refused (ENOBUFS) or discarded, after which even a
 drive that sends counts as lost, ms."""
@@ -45,12 +45,12 @@ _NEVER: Final = -(1 << 62)
 
 
 class BusWatch:
-    """Tracks when the drive last sent a frame, and which own frames have not been carried yet.
+    """Tracks when the drive last sent a frame, and which of our frames have not been carried yet.
 
     Attributes:
-        echoes: True if the interface returns own frames once they are carried. Otherwise each frame
+        echoes: True if the interface returns our frames once they are carried. Otherwise each frame
             of the drive counts as proof that the bus carries frames.
-        unacknowledged: True after own frames were not carried, until one is.
+        unacknowledged: True after our frames were not carried, until one is.
     """
 
     def __init__(self, *, echoes: bool) -> None:
@@ -69,7 +69,7 @@ class BusWatch:
             self.carried(now_ns)
 
     def sent(self, now_ns: int) -> None:
-        """Record that the bus accepted an own frame, whose echo must follow."""
+        """Record that the bus accepted one of our frames, whose echo must follow."""
         if self.echoes:
             self._waiting.append(now_ns)
 
@@ -78,7 +78,7 @@ class BusWatch:
         self._blocked_ns = self._blocked_ns or now_ns
 
     def carried(self, now_ns: int) -> None:
-        """Record an own frame's echo, or another proof that the bus carries frames.
+        """Record the echo of one of our frames, or another proof that the bus carries frames.
 
         Frames are carried in order, so frames sent long before were carried too, even if their
         echoes were lost in a full receive buffer.
@@ -108,12 +108,12 @@ class BusWatch:
         return self.may_send(now_ns) and now_ns - self._carried_ns <= PROOF_MS * NS_PER_MS
 
     def carries_nothing(self, now_ns: int) -> bool:
-        """Return True if the bus has carried no own frame for `BLOCKED_MS` although it should."""
+        """Return True if the bus carried none of our frames for `BLOCKED_MS` although it should."""
         return bool(self._blocked_ns) and now_ns - self._blocked_ns > BLOCKED_MS * NS_PER_MS
 
     @property
     def waits(self) -> bool:
-        """True while echoes of own frames are missing."""
+        """True while echoes of our frames are missing."""
         return bool(self._waiting)
 
     def heard_in_order(self, now_ns: int) -> bool:
@@ -126,7 +126,7 @@ class BusWatch:
         return not self.unacknowledged and (not waiting or now_ns - waiting[0] < ASK_AFTER_NS)
 
     def waited_ns(self, now_ns: int) -> int:
-        """Return the age of the oldest own frame without an echo, ns; 0 if all have one."""
+        """Return the age of the oldest frame of ours without an echo, ns; 0 if all have one."""
         return now_ns - self._waiting[0] if self._waiting else 0
 
     def restart_due(self, now_ns: int) -> bool:

@@ -37,7 +37,7 @@ RETRY_MS: Final = 200
 COMMANDS_MS: Final = 40
 """Time after which a command that the bus has not accepted is dropped as outdated, ms."""
 ECHOING: Final = ("socketcan", "xrl_unix")
-"""Interfaces that return own frames once the bus has carried them."""
+"""Interfaces that return our frames once the bus has carried them."""
 ECHOED: Final = (Command.SET_INPUT_POS, Command.SET_INPUT_TORQUE, Command06.GET_VERSION)
 """Commands to axis0 whose echo is awaited; each packet of targets or torques contains one."""
 HEARD: Final = (
@@ -328,7 +328,7 @@ class CanLink:
 
 
 def filters(node_ids: Sequence[int]) -> list[dict[str, Any]]:
-    """Return python-can's filters for drives' frames and own frames whose echo is awaited.
+    """Return python-can's filters for drives' frames and our frames whose echo is awaited.
 
     Error frames pass the filters.
     """

@@ -211,7 +211,7 @@ class LimpLegWatch(msgspec.Struct):
     """Watch over modules that are DISARMED while their drives do not hold."""
 
     since_ns: tuple[int, ...] = (0,) * N_MODULES
-    """Time since which each module is in that state; 0 if it is not."""
+    """Time from which each module is in that state; 0 if it is not."""
 
     def advance(self, now_ns: int, states: Sequence[JointState]) -> Support:
         """Return the modules that must stiffen.

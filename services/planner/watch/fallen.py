@@ -85,7 +85,7 @@ class FallState(msgspec.Struct):
     """State of `FallWatch`."""
 
     since_ns: int = 0
-    """Time since which two signs are present; 0 if they are not."""
+    """Time from which two signs are present; 0 if they are not."""
     tipped_ns: int = 0
     """Time at which a sole last tipped."""
     whirled_ns: int = 0

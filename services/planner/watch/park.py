@@ -67,13 +67,13 @@ class ParkState(msgspec.Struct):
     assist: float = 0.0
     """A, N, before the limit of its rate."""
     still_ns: int = 0
-    """Time since which the robot has been still in a working pose; 0 if it is not."""
+    """Time from which the robot has been still in a working pose; 0 if it is not."""
     away_ns: int = 0
-    """Time since which the robot has been untouched; 0 while somebody touches it."""
+    """Time from which the robot has been untouched; 0 while somebody touches it."""
     opens_ns: int = 0
-    """Time since which a force that can open height and pitch has acted; 0 without such a force."""
+    """Time from which a force that can open height and pitch has acted; 0 without such a force."""
     pull_ns: int = 0
-    """Time since which somebody has pulled along the floor; 0 without a pull."""
+    """Time from which somebody has pulled along the floor; 0 without a pull."""
     bumped_ns: int = 0
     """Time of the last bump."""
 

@@ -69,9 +69,9 @@ class TripsState(msgspec.Struct):
     """State of `PlannerTrips`."""
 
     since_ns: tuple[int, ...] = (0,) * len(PLANNER_TRIPS)
-    """Time since which each value is beyond its limit; 0 if it is not."""
+    """Time from which each value is beyond its limit; 0 if it is not."""
     calm_ns: int = 0
-    """Time since which no value is beyond its limit."""
+    """Time from which no value is beyond its limit."""
     tripped: Trip = Trip.NONE
     """Active trip, which prevents the planner from engaging."""
     why: str = ""

@@ -68,9 +68,9 @@ class _OpenDirection(msgspec.Struct):
     drive: float = 0.0
     """Acceleration at the release, m/s^2 or rad/s^2."""
     released_ns: int = 0
-    """Time since which the direction has been without a leading hand; 0 while a hand leads it."""
+    """Time from which the direction has been without a leading hand; 0 while a hand leads it."""
     back_ns: int = 0
-    """Time since which a hand has been back; 0 without a hand."""
+    """Time from which a hand has been back; 0 without a hand."""
 
 
 class Unattended(msgspec.Struct):

@@ -48,7 +48,7 @@ class Drivetrain(Section, frozen=True):
     rotor_inertia: Annotated[float, Range(0.01, 5.0, "kg m^2")] = 0.15
     """Inertia of the rotor, reflected to the joint, like `joint.armature`."""
     motor_friction: Annotated[float, Range(0.0, 20.0, "N m")] = 0.2
-    """Dry friction on the motor's side, at the joint."""
+    """Dry friction of the rotor, reflected to the joint."""
     joint_friction: Annotated[float, Range(0.0, 20.0, "N m")] = 0.1
     """Dry friction on the joint's side: bearings and cables."""
     motor_damping: Annotated[float, Range(0.0, 50.0, "N m s/rad")] = 0.3

@@ -205,7 +205,7 @@ def what_to_see(module: str, axis: int, by: float) -> str:
 
 
 def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
-    """Return the verdict on a completed jog."""
+    """Return the checks of a completed jog."""
     axis, other, by = plan.axis, 1 - plan.axis, plan.course.by
     rest = [s for s in samples if s.t_s < SETTLE_S][-20:]
     moving = [s for s in samples if SETTLE_S <= s.t_s <= plan.duration_s - SETTLE_S]

@@ -214,7 +214,7 @@ def _safe_ms(
 def _remarks(
     case: CrashCase, safe_ms: float | None, reaction: Sequence[tuple[str, JointEvent]]
 ) -> list[str]:
-    """Return the unexpected mode changes of modules that were not hit, as text."""
+    """Return the unexpected reactions of modules that were not hit, and all trips, as text."""
     others = [(name, event) for name, event in reaction if name in case.others]
     changed = sorted({name for name, _ in others})
     words = []
