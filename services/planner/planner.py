@@ -40,6 +40,7 @@ from shared.bus.messages import (
     SplitSource,
     Tare,
     Vector3,
+    Vector4,
     Wrench,
 )
 from shared.clock import NS_PER_MS, NS_PER_S
@@ -49,9 +50,9 @@ from shared.robot.hold_rules import Support
 from shared.rounding import DECIMALS, rounded
 
 EARLY_FRACTION = 0.5
-"""Fraction of a period; states that arrive sooner after a tick still belong to that tick."""
+"""Minimum time between two ticks, as a fraction of a period."""
 LATE_FRACTION = 1.25
-"""Fraction of a period after which the planner ticks with the states it has."""
+"""Fraction of a period after the last tick at which the planner ticks with the states it has."""
 TICK_GAP_MAX_S = 0.02
 """Maximum integration step, s; a longer gap between ticks means a stopped process."""
 
@@ -62,7 +63,7 @@ _WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
 
 
 class PlannerState(msgspec.Struct, kw_only=True):
-    """Everything in `Planner` that changes between ticks; lists have one entry per module."""
+    """State of `Planner` between ticks; lists have one entry per module."""
 
     states: list[JointState | None] = msgspec.field(default_factory=lambda: [None] * N_MODULES)
     arrived_ns: list[int] = msgspec.field(default_factory=lambda: [0] * N_MODULES)
@@ -96,6 +97,8 @@ class PlannerState(msgspec.Struct, kw_only=True):
     unattended: Unattended = msgspec.field(default_factory=Unattended)
     trips: TripsState = msgspec.field(default_factory=TripsState)
     fall: FallState = msgspec.field(default_factory=FallState)
+    led: Vector4 = (0.0, 0.0, 0.0, 0.0)
+    """COM height, m, and pitch, rad, of the last tick, and their rates."""
     park: ParkState = msgspec.field(default_factory=ParkState)
     """Changes only if the robot may park."""
 
@@ -138,7 +141,8 @@ class Planner:
     """The planner without I/O: the whole-body law, and the decision whether it leads.
 
     Attributes:
-        session: number drawn at random at each start; sent in every command.
+        session: random number drawn at the start, plus 1 each time modules refuse it for good; sent
+            in every command.
         state: everything that changes between ticks. A snapshot is a copy of it
             (`shared.state.copied`), from which another planner continues bit for bit. A custom
             controller's own state is not part of it.
@@ -156,7 +160,7 @@ class Planner:
         """
         self.session = session
         self.state = PlannerState()
-        if controller is not None:  # else the integral winds up against it
+        if controller is not None:  # otherwise the push integral would wind up against it
             law = msgspec.structs.replace(config.law, push_integral_max=0.0)
             config = msgspec.structs.replace(config, law=law)
         self._law = Hocca(config)
@@ -322,7 +326,7 @@ class Planner:
                 toward=self._toward(heat.toward),
                 released=(height or s.park.closed, pitch or s.park.closed),
                 pitch_drive=s.unattended.pitch.drive,
-                # in HOLD, the law restarts from the measured pose, so engaging makes no step
+                # until the planner leads, each tick restarts the law, so engaging makes no step
                 align=s.engagement.hold,
                 wrench=inputs.wrench,
                 up_torso=inputs.up,
@@ -348,18 +352,18 @@ class Planner:
 
     def _parked_assist(self, inputs: Inputs) -> float:
         """Return the assist that a parked robot gives, N; decide whether it is parked."""
-        s, wrench, output = self.state, inputs.wrench, self._output
+        s, wrench = self.state, inputs.wrench
         touch = None
-        if wrench is not None and output is not None and s.heat.lifted is not None:
+        if wrench is not None and s.heat.lifted is not None:
             right, left = KNEES
             knee = max(float(inputs.q[right]), float(inputs.q[left]))
             kg = s.law.load.kg - s.trust.load[0]
-            z, pitch = float(output.pdot[2]), float(output.pdot[4])
+            z, pitch, z_rate, pitch_rate = s.led
             height = s.law.height
-            sinks = height.hold[0] * (height.height - float(output.p[2]))
+            sinks = height.hold[0] * (height.height - z)
             touch = Touch(
                 s.heat.lifted, wrench.moment[1], wrench.force[:2],
-                (knee, float(output.p[4]), kg), (z, pitch), sinks,
+                (knee, pitch, kg), (z_rate, pitch_rate), sinks,
             )  # fmt: skip
         may = not s.engagement.hold and inputs.request.assist_n == 0.0
         may = may and not self._sits and not s.heat.moves
@@ -367,7 +371,7 @@ class Planner:
         return self._park.advance(s.park, inputs.now_ns, touch, park, inputs.dt, may=may)
 
     def _watch(self, inputs: Inputs, output: LawOutput) -> None:
-        """Estimate the load, and check the trips at the measured pose."""
+        """Estimate the load; check for drift, trips and a fall."""
         s, wrench, leads = self.state, inputs.wrench, not self.state.engagement.hold
         lifted = None
         if wrench is not None:
@@ -384,6 +388,7 @@ class Planner:
         if wrench is not None and lifted is not None and not self._sits:
             hand = lifted + output.assist, wrench.moment[1]
         pose, rates = output.p.tolist(), output.pdot.tolist()
+        s.led = (pose[2], pose[4], rates[2], rates[4])
         drift = s.unattended.advance(
             inputs.now_ns, (pose[2], pose[4]), (rates[2], rates[4]), hand, leads=leads
         )
@@ -469,11 +474,11 @@ class Planner:
 
     @property
     def _sits(self) -> bool:
-        """True while the robot lowers itself, on request or for a low supply."""
+        """True while the robot lowers itself, on request or because a supply is low."""
         return self.state.request.sit or self.state.supply.sits
 
     def _inhibit(self) -> PlannerMode | None:
-        """Return the mode that prevents engaging, from the last tick's results; None if allowed."""
+        """Return the mode that prevents engaging, from the latest results; None if allowed."""
         s = self.state
         if s.rival.yields:
             return PlannerMode.YIELDING

@@ -26,6 +26,7 @@ from shared.arrays import Array
 from shared.bus.messages import Attitude, DriveStatus, JointCommand, Mode, PlannerMode, SplitSource
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.joints import N_MODULES
+from shared.state import copied
 from tests.imu.robots import with_imu
 from tests.planner.states import (
     ROBOT,
@@ -309,6 +310,21 @@ def test_a_planner_goes_on_bit_for_bit(name: str) -> None:
         assert "99" in status.why
     else:
         assert math.hypot(*status.stance[:3]) > 1e-3
+
+
+def test_a_planner_that_may_park_goes_on_bit_for_bit() -> None:
+    """It parks when it would have: how long it has stood still does not begin again."""
+    robot = msgspec.structs.replace(ROBOT, park=msgspec.structs.replace(ROBOT.park, enabled=True))
+    planner, twin, q = Planner(robot, SESSION), Planner(robot, SESSION), closed(0.95)
+    for tick in range(43):
+        now_ns = START_NS + tick * TICK_NS
+        if tick == 40:
+            assert planner.state.park.still_ns > 0
+            twin.state = copied(planner.state)
+        for each in (planner, twin) if tick >= 40 else (planner,):
+            each.receive_wrench(wrench(-20.0, seq=tick), now_ns)
+            ticked(each, q, now_ns, tick)
+    assert msgspec.json.encode(twin.state) == msgspec.json.encode(planner.state)
 
 
 PERIOD_NS = 4 * NS_PER_MS
