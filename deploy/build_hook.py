@@ -1,4 +1,4 @@
-"""What the wheel holds beside the packages: the data files, and the commit it is built from."""
+"""Files that the wheel contains besides the packages: data files, and the commit of the build."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ FILES = (
     "sysctl",
     "udev",
 )
-"""Names in `deploy/`. A wheel installs them into `shared/files/`; `shared/places.py` knows both."""
+"""Names in `deploy/`. A wheel installs them into `shared/files/`; `shared/places.py` finds both."""
 
 
 class WheelFiles(BuildHookInterface):  # type: ignore[type-arg]  # hatchling names no configuration
-    """Lays the files into a wheel; an editable one has the checkout's own."""
+    """Adds the files to a wheel; an editable install uses the checkout's own."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Say what goes where."""
+        """Add the files to the build data."""
         root = Path(self.root)
         main = {str(root / "deploy" / "xrl_main.py"): "xrl_main.py"}
         if version == "editable":
@@ -44,6 +44,6 @@ class WheelFiles(BuildHookInterface):  # type: ignore[type-arg]  # hatchling nam
         build_data["force_include"] |= main | files | {str(commit): BUILT_FROM}
 
     def finalize(self, version: str, _build_data: dict[str, Any], _artifact: str) -> None:
-        """Remove what was made for the build."""
+        """Remove the temporary files of the build."""
         if version != "editable":
             self._scratch.cleanup()

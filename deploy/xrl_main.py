@@ -1,7 +1,7 @@
-"""Entry of the command `xrl`: this project's packages, whoever else has one of their names.
+"""Entry point of `xrl`: imports this project's packages, even if others have the same names.
 
-`tools` and `shared` are common names: a folder of PYTHONPATH that has such a package would be found
-before ours, here and in every process that is started from here.
+`tools` and `shared` are common names: such a package in a folder of PYTHONPATH would be found
+before ours, here and in every child process.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from pathlib import Path
 
 PACKAGES = ("services", "shared", "tools")
 HERE = next(p for p in Path(__file__).resolve().parents if (p / PACKAGES[0]).is_dir())
-"""Folder of our packages: a checkout's top, or beside this file where they are installed."""
+"""Folder of our packages: the checkout's root or, if installed, this file's folder."""
 
 
 def main() -> int:
     """Run the command line."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # no process of ours takes packages from where it is started
+    os.environ["PYTHONSAFEPATH"] = "1"  # our processes import nothing from their working directory
     if any(map(_is_hidden, PACKAGES)):
         sys.path.insert(0, str(HERE))
         before = os.environ.get("PYTHONPATH")

@@ -70,7 +70,7 @@ class BalanceEnv(gymnasium.Env[Array, Array]):
         return law.seen, {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Apply an action for 10 ms; the reward is 1 with the COM over the ankles."""
+        """Apply an action for 10 ms; the reward is at most 1, with the COM over the ankles."""
         self._law.action = np.clip(action, -1.0, 1.0)
         row = next(self._rows, None)
         if row is None:

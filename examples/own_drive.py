@@ -18,7 +18,7 @@ FRICTION = 2.0  # N m s/rad
 
 
 class BenchDrive:
-    """A module in virtual time, which each `read` advances by 2 ms."""
+    """A module in virtual time; each `read` advances it by 2 ms."""
 
     def __init__(self, q: Pair, load: Pair = (0.0, 0.0)) -> None:
         """Place the joint at q (phi, theta), rad, under a load, N m."""

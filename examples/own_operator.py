@@ -1,7 +1,7 @@
 """A simulated operator of your own: a hand that leads with at most 12 N along z.
 
-The simulated person is a class with one method, `force`. Controllers receive only the resulting
-wrench at the harness. Run: python examples/own_operator.py
+The shipped hand is the class `Operator`; this script replaces its method `force`. Controllers
+receive only the resulting wrench at the harness. Run: python examples/own_operator.py
 """
 
 from __future__ import annotations

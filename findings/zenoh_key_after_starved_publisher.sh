@@ -4,15 +4,15 @@
 # Guess: a sample's key is the publisher's key. A publisher that gets too little processor time may be
 # disconnected, so messages are late or lost, but they never arrive under another key.
 # Seen: a starved publisher misses its lease, and the subscriber closes the link and dials again. Then the
-# subscriber of another key may get a message, and sample.key_expr names that other key. 12 publishers of
-# 30 keys: 118 of 2.1 million messages in 80 s, in short bursts.
+# subscriber of another key may get a message, and sample.key_expr names that other key. 12 publishers
+# with 30 keys each: 118 of 2.1 million messages in 80 s, in short bursts.
 # Likely cause, from the source of 1.9.0: keys are numbers on a link. While the publisher closes the old
 # link, it can accept the new one into the old transport, and sends with the old link's numbers; the
 # subscriber looks them up in the new link's table.
-# An attachment that holds the publisher's key shows it; shared/bus/session.py attaches and compares it.
+# An attachment that holds the publisher's key reveals this; shared/bus/session.py attaches and compares it.
 #
 # The publishers are starved with SIGSTOP and SIGCONT, so no privileges are needed. Under real-time priorities
-# the same happens without signals, to processes that the others leave no time.
+# the same happens without signals, to processes that get no processor time.
 #
 # Needs python3 with venv; takes up to three minutes. It fails if no message comes under a wrong key.
 set -euo pipefail

@@ -1,4 +1,4 @@
-"""Command line parser of every verb, service and script: flags are written out in full."""
+"""Command line parser of every verb, service and script: flags must be written in full."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def atomic_file(
     part = path.with_name(f".{path.name}.part")
     try:
         _refuse_existing(path, exclusive=exclusive)
-        part.unlink(missing_ok=True)  # of an earlier attempt; its rights may be wrong
+        part.unlink(missing_ok=True)  # left by an earlier attempt, perhaps with wrong permissions
         mode = 0o600 if private else 0o666
         with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             yield file
@@ -55,7 +55,7 @@ def _refuse_existing(path: Path, *, exclusive: bool) -> None:
 
 
 def _sync_directory(directory: Path) -> None:
-    """Write the directory, which has the file's new name, to the disk."""
+    """Sync the directory, which contains the file's new name, to the disk."""
     with contextlib.suppress(OSError):  # not every file system supports this
         descriptor = os.open(directory, os.O_RDONLY)
         try:

@@ -1,4 +1,4 @@
-"""Optional packages: the extra of pyproject.toml with each, and the error if one is missing.
+"""Optional packages: the extras of pyproject.toml, and the error if a package is missing.
 
 `pip install xrl` installs the packages that a robot needs in operation. A verb that needs others
 first calls `require`. A module imports such a package with `late`, so that the module can be

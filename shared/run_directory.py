@@ -34,7 +34,7 @@ RUN_DIR_VARIABLE = "XRL_RUN_DIR"
 
 
 FLEET_VARIABLE: Final = "XRL_FLEET"
-"""Environment variable with the run directory, which the supervisor sets for its processes."""
+"""Environment variable that the supervisor sets for its processes: the run directory."""
 
 _MEMORY_FOLDERS: Final = (Path("/run/lock"), Path("/dev/shm"))  # noqa: S108 - owners are checked
 """Folders for the live directories, best first. At logout systemd may remove a user's files from
@@ -64,8 +64,8 @@ def live_dir(run_dir: Path) -> Path:
 def _memory_folder(folders: tuple[Path, ...]) -> Path | None:
     """Return the first folder that is in memory and where every user may write, or None.
 
-    The folder's type and mode decide, not the rights of this process, because a systemd unit and a
-    shell must find the same folder.
+    The folder's type and mode decide, not the permissions of this process, because a systemd unit
+    and a shell must find the same folder.
     """
     mounts = [line.split() for line in Path("/proc/self/mounts").read_text("utf-8").splitlines()]
     for folder in folders:
@@ -90,7 +90,7 @@ def check_own(path: Path, *, alone: bool = True) -> None:
 
     A missing directory is accepted. `alone`: also refuse a directory if others may write to it or
     to one above it. Starting or changing a fleet requires this stricter check. Stopping one does
-    not, because the rights may have changed while the fleet ran. Raises FleetError.
+    not, because the permissions may have changed while the fleet ran. Raises FleetError.
     """
     for directory in dict.fromkeys((path, live_dir(path))):
         _check_directory(directory, alone=alone)

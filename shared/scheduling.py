@@ -154,7 +154,7 @@ def real_time_pause_ms(root: Path = Path("/")) -> float:
 
 
 def _real_time_limit_us() -> int | None:
-    """Lift the limit on uninterrupted real-time computing; return the limit that remains, us.
+    """Lift the limit on uninterrupted real-time computing; return what remains of it, us, or None.
 
     Beyond it the kernel ends a process (SIGXCPU, then SIGKILL), but a long cycle must not end a
     service.

@@ -7,8 +7,9 @@
         \"\"\"stop after S seconds\"\"\"
 
 A field's type determines how its flag is parsed: `bool` is a switch, a `Literal` is a choice, a
-tuple may be repeated, and a number has a `Range` with its unit. The string below a field is its
-help, also for completion and the reference page. `check` holds rules that involve several fields.
+tuple's flag may be repeated, and a number has a `Range` with its unit. The string below a field is
+its help, also for completion and the reference page. `check` holds rules that involve several
+fields.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def _build(function: ca.Function, compiler: str, path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Flush a file or folder to disk, because an incomplete library would crash its processes."""
+    """Flush a file or folder to disk, because an incomplete library would crash processes."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -123,7 +123,7 @@ def _sync(path: Path) -> None:
 
 
 def compare(function: ca.Function, translated: ca.Function) -> None:
-    """Compare a graph with its translation on random arguments."""
+    """Raise RunError if a graph and its translation differ on random arguments."""
     draw, finite = np.random.default_rng(1), 0
     for sample in range(SAMPLES):
         most = DRAWN_MAX[sample % 2]

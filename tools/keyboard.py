@@ -33,7 +33,7 @@ class Keyboard(Generic[K]):
         return self._descriptor >= 0
 
     def __enter__(self) -> Self:
-        """Start to read single keys, if this process is in the foreground of a terminal."""
+        """Start reading single keys, if this process is in the foreground of a terminal."""
         try:
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor) and _is_foreground(descriptor):
@@ -58,7 +58,7 @@ class Keyboard(Generic[K]):
             self._descriptor = -1
 
     def wait(self, timeout_s: float) -> list[K]:
-        """Return the pressed keys as soon as there is one, or none after a timeout, s."""
+        """Return the pressed keys as soon as one is pressed, or none after a timeout, s."""
         if not self.present:
             time.sleep(timeout_s)
             return []

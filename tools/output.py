@@ -94,7 +94,7 @@ def _check_replaceable(out: Path, *, force: bool) -> None:
     for path in out.iterdir():
         if path.name in runs or path.is_dir() or path.suffix not in _EXPORTED:
             raise RunError(
-                f"{out}: {path.name} in it is not part of an export; remove it yourself, or "
+                f"{out}: contains {path.name}, which is not part of an export; remove it, or "
                 "choose another name"
             )
 
@@ -118,6 +118,6 @@ def new_figure(width: float, height: float, dpi: int = 110) -> Picture:
 
 
 def save_figure(figure: Picture, path: Path) -> None:
-    """Write a Matplotlib figure whole or not at all; the suffix names its format."""
+    """Write a Matplotlib figure whole or not at all; the suffix selects the format."""
     with atomic_file(path) as file:
         figure.savefig(file, format=path.suffix.removeprefix("."))

@@ -27,7 +27,7 @@ COLD_STEP_MAX = 0.5
 EVALUATIONS_MAX = 60
 """Evaluations of the kinematics per start; from a bent stand the median is 8."""
 CLOSURE_WEIGHT = 10.0
-"""Weight of the closure error relative to the error of p; `shift` removes the remaining one."""
+"""Weight of the closure error relative to the error of p; `shift` removes the rest."""
 CLOSING_ROUNDS = 5
 """Rounds of the multiplier method; each reduces the closure error about a hundredfold."""
 STATIONARY = 1e-3
@@ -218,9 +218,9 @@ def describe(reach: Reach, p_ref: Array, limits: Array) -> str:
     )
     if reach.outcome is IkEnding.UNFINISHED:
         verdict = "was not reached"
-        why = f"stopped after {reach.evaluations} evaluations, a closer pose may exist"
+        why = f"stopped after {reach.evaluations} evaluations; a closer pose may exist"
     else:
         verdict = "cannot be reached"
-        why = stops or "the legs reach no further, no joint is at its limit"
+        why = stops or "the legs reach no further, and no joint is at its limit"
     others = "".join(f"; {row} there" for row in misses[1:])
     return f"p_ref {verdict}: {misses[0]} is the closest: {why}{others}"

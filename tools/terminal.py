@@ -2,8 +2,8 @@
 
 Text from a log, the bus or another host is data: only `marked` templates are parsed for Rich's
 markup, and control characters are shown escaped (`tools.guarded_streams`). Tables for a pipe or a
-file are as wide as they need to be, without frames and colours. A terminal folds cells that do not
-fit.
+file are as wide as they need to be, without frames and colours. On a terminal, cells that do not
+fit are folded.
 """
 
 from __future__ import annotations

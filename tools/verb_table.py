@@ -127,7 +127,7 @@ VERBS: Final = (
             ("kill", "kill the planner in random poses, under random pushes"),
             ("robust", "simulate robots with random plant errors: which fall, and why"),
             ("latency", "compare three controllers over bad networks"),
-            ("push", "find the largest withstood push, with the planner alive and dead"),
+            ("push", "find the largest push that the robot withstands, with and without planner"),
             ("wearer", "simulate wearers who squat, rest, let go or go limp, with park off and on"),
         )
     ),

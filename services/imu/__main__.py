@@ -22,7 +22,7 @@ def main() -> int:
 
 
 def made(config: RobotConfig, run_dir: Path) -> SensorService:
-    """Return the service of the sensor on the bus that the robot file names."""
+    """Return the service of the robot's IMU."""
     imu = config.imu
     sensor = sensor_of(config, imu, ImuAssembler(), run_dir)
 

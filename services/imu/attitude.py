@@ -60,7 +60,7 @@ class AttitudeLaw:
         self._changed_ns = 0
 
     def step(self, now_ns: int, sample: ImuSample | None) -> AttitudeReading:
-        """Process the newest sample, or None if there is none; return the reading."""
+        """Process the newest sample, or None without a new one; return the reading."""
         if sample is not None and not _is_unit(sample.quaternion):
             self.refused += 1
             sample = None

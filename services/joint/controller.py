@@ -1,7 +1,6 @@
 """One control cycle of a joint service, without any I/O.
 
-The same object runs live behind a drive and a bus, in lockstep under virtual time, and in
-re-execution from a log.
+The same code runs live, in lockstep under virtual time, and when a log is re-executed.
 """
 
 from __future__ import annotations
@@ -168,7 +167,7 @@ class JointController:
         return s.tau
 
     def is_state_due(self, s: ControllerState) -> bool:
-        """Return True if a state is due: in every nth cycle, at the phase the planner requests."""
+        """Return True if a state is due: in every nth period, at the phase the planner requests."""
         return s.clock.passed(self._state_every, self._state_phase(s))
 
     def _state_phase(self, s: ControllerState) -> int:
@@ -261,7 +260,7 @@ class JointController:
         return _NONE
 
     def _enter(self, s: ControllerState, now_ns: int, before: Mode) -> None:
-        """Start a mode from the present setpoint, or from the torque of an armed drive."""
+        """Start a mode from the present setpoint; after DISARMED, by standing or taking over."""
         law = self._law
         q, v = s.estimate.q, s.estimate.v
         if before is not Mode.DISARMED:
@@ -287,7 +286,7 @@ class JointController:
         self.heat.advance(s.heat, now_ns, motor_torque(s.tau, self._gear_ratio), fet, motor)
 
     def _wanted(self, s: ControllerState, now_ns: int, setpoint: Setpoint) -> Pair:
-        """Return the law's torque plus the rest of the take-over's offset, N m."""
+        """Return the law's torque plus the remaining take-over offset, N m."""
         wanted = pd_law.torque(setpoint, s.estimate.q, s.estimate.v)
         if s.takeover_offset == pd_law.ZERO:
             return wanted

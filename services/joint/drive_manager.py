@@ -311,7 +311,7 @@ class DriveManager:
         return LastState.DAMP if mode is Mode.DAMP or s.estop else LastState.HELD
 
     def _inhibit(self, now_ns: int, reading: DriveReading | None) -> ArmingInhibit | None:
-        """Return the reason not to arm now, or None if it is not known yet."""
+        """Return the reason not to arm, `NONE` to arm now, or None to wait without a report."""
         s = self.state
         if reading is None or reading.status is DriveStatus.LOST:
             return None

@@ -47,13 +47,13 @@ HOLD_SHARE: Final = {"ankle": 1.0, "knee": 0.2, "hip": 0.0}
 """Fraction by which a drive's own gains rise from the module's towards HOLD's, by kind of module.
 
 An ankle's gains rise fully. On TRACK's gains, with at most 4 N m s/rad on its phi and all six
-services dead, a push from the side decayed by 0.72 each half swing, and 7 of 26 pairs of pushes in
-step with the swing made the robot fall. A knee's gains rise by a fifth, to about 600 N m/rad.
-Without that, a knee whose service froze was soft while the other knee was stiff, and the robot
-moved by 450 mm and fell; with it, the robot moves by 23 mm. If a knee's gains rose fully, the hand
-would feel them, because the service subtracts them 2 ms late: 26 N in the squat, compared with 18 N
-without a rise and 19.8 N with a fifth. A module that HOLD stiffens only in phi keeps its gains,
-because half of a rise would act on theta.
+services dead, the sway after a sideways push decayed by a factor of 0.72 each half swing, and 7 of
+26 pairs of pushes in step with the sway made the robot fall. A knee's gains rise by a fifth, to
+about 600 N m/rad. Without that, a knee whose service froze was soft while the other knee was stiff,
+and the robot moved by 450 mm and fell; with it, the robot moves by 23 mm. If a knee's gains rose
+fully, the hand would feel them, because the service subtracts them 2 ms late: 26 N in the squat,
+compared with 18 N without a rise and 19.8 N with a fifth. A module that HOLD stiffens only in phi
+keeps its gains, because half of a rise would act on theta.
 """
 
 

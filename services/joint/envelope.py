@@ -10,9 +10,9 @@ The coupled torque corrects the pose of the whole body, so in each module it pul
 the local spring. A coupled torque that drives the joint away from its reference is wrong, even if
 it is within its bound: wrong torques of knees and hips, ramped up together within their bounds,
 made the robot fall.
-It also does little work on a moving joint: 2 J under a push, and 6 J when a hand leads up by 0.45 m
-in a second, because it includes the eased lead. More work moves the robot: torques of knees and
-hips that rose within 0.3 s threw it off the floor.
+The coupled torque also does little work on a moving joint: 2 J under a push, and 6 J when a hand
+leads the robot up by 0.45 m in a second, because it includes the eased lead. More work moves the
+robot: torques of knees and hips that rose within 0.3 s threw it off the floor.
 
 A reference comes with its rate, and an ankle's reference follows its rate: within 0.3 mrad while a
 person leads, within 20 mrad while the height follows its own reference. A reference that drifts
@@ -71,7 +71,7 @@ class Envelope:
     """Bounds on the commands of one module."""
 
     def __init__(self, config: RobotConfig, module: str) -> None:
-        """Read the bounds; without a schedule that has bounds, every command is inside."""
+        """Read the bounds of a certified split; without bounds, every command is inside."""
         schedule = config.gain_schedule
         table = schedule.bounds if config.law.split == "certified" and schedule else None
         self._bounds = bounds = table[kind_of(module)] if table else None

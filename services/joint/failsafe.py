@@ -126,7 +126,8 @@ TAU_ACCEPTED_MAX: Final = 4.0
 """Largest accepted feedforward and coupled torque, as a multiple of a module's maximum torque: far
 from its reference the law may request more than the maximum, which the limiter cuts."""
 SEQ_AHEAD_MAX: Final = 500
-"""Largest accepted step of `seq`: after a far too high one, all correct ones would be refused."""
+"""Largest accepted step of `seq` beyond the ticks that `TICKS_PER_S_MAX` allows: after a far too
+high one, all correct ones would be refused."""
 TICKS_PER_S_MAX: Final = 2000
 """Maximum rate of a planner's ticks, 1/s, including those whose commands are lost."""
 REFUSED_SHOWN_NS: Final = NS_PER_S
@@ -292,7 +293,7 @@ class Failsafe(msgspec.Struct):
             gone = estop or not (drive is _NONE or drive is _DRIVE_ARMED)
             if not gone and event is not _FALLEN:
                 event = trip
-                self.fresh_since_ns = now_ns  # after a trip it waits as after a dropout
+                self.fresh_since_ns = now_ns  # after a trip the module waits as after a dropout
         row = TRANSITIONS[mode].get(event)
         self.dropouts.advance(
             now_ns,

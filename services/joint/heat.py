@@ -36,7 +36,7 @@ UNKNOWN_S: Final = -1.0
 """Value of `left_s` without an estimate."""
 FOLLOW: Final = 0.5
 """Share of a thermistor's deviation that corrects both winding and housing, once a second. An error
-of the housing shifts its winding by 2 % of the error every second, so the readings correct it
+in the housing shifts its winding by 2 % of the error every second, so the readings correct it
 within a minute."""
 HOLDS_S: Final = 60.0
 """Time for which a drive is assumed to hold after its service ended, s."""
@@ -90,7 +90,7 @@ class _Motor(NamedTuple):
 
 
 class HeatEstimate:
-    """Temperatures of one module.
+    """Estimates the temperatures of one module.
 
     Attributes:
         enabled: True if [heat] of the robot file describes the motors.

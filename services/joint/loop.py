@@ -95,7 +95,7 @@ class JointPorts(msgspec.Struct, frozen=True):
     traces: Outbox[JointTrace] | None
     """None if nothing is recorded for re-execution."""
     planner: _SessionEnds | None = None
-    """None if the end of its process cannot be detected; then its commands become stale."""
+    """None if the end of the planner's process cannot be detected; only stale commands show it."""
 
 
 class JointLoop:
@@ -176,7 +176,7 @@ class JointLoop:
         step = module.step(now, reading, command, estop, near)
         controller, state = module.controller, module.state.controller
         due = controller.is_state_due(state)
-        if state.states == 0:  # it arms only once a state is published
+        if state.states == 0:  # the module arms only once a state is published
             self._has_sent, due = ports.states.put(controller.state(state, now)), False
         self._write(step)
         if self._neighbours is not None:

@@ -8,9 +8,9 @@ After an emergency stop the knees sink, and each module must react to the others
 - If the hips only damped, the thighs would drag the torso back by 1.5 rad; with its COM 5 cm back
   and 10 cm up, the robot fell over. So a hip uses its ankle's and knee's angles to hold the torso's
   attitude.
-- A knee that sinks beside a knee whose service is dead tips the robot sideways: it fell within 4 s.
-  Beside an ankle or hip whose drive kept holding, it fell in 28 of 40 stops. So a knee stops
-  sinking if another module does not go down.
+- A knee that sinks beside a knee whose service is dead tips the robot sideways: the robot fell
+  within 4 s. With knees sinking beside an ankle or hip whose drive kept holding, it fell in 28 of
+  40 stops. So a knee stops sinking if another module stays up.
 
 If a knee or ankle is limp, others stiffen, in HOLD and in DAMP (`shared.robot.hold_rules`). Without
 that, the robot fell within 1.3 s after a knee went limp with the planner dead, and within 2 s after
@@ -19,7 +19,7 @@ stiffened only after 100 ms, at DRIVE_LOST, the robot fell in 3 of 4 squats.
 
 All this must work without planner and bus. So in each cycle each service stores its row in a file
 that all six have mapped, which the control path may do. Modules on another host are unknown: hips
-then damp, knees sink, and only a planner makes the others stiffen.
+then damp, knees sink, and only a planner makes modules stiffen.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class NeighbourRow(NamedTuple):
     caught: int = 0
     """1 in DAMP if it does not sink: a caught knee, or a module that has stiffened."""
     silent: int = 0
-    """1 if its drive has been silent for `SILENT_NS`, and is not yet lost."""
+    """1 if the module is not DISARMED and its drive has been silent for `SILENT_NS`."""
 
 
 class NeighbourView(NamedTuple):

@@ -52,7 +52,7 @@ class LastState(IntEnum):
     """Last state of the service before this one."""
 
     NOTHING = 0
-    """There was no service, it ended normally, or a person has requested the module."""
+    """No service armed the drive, the fleet was stopped, or a person has requested the module."""
     HELD = 1
     """It held the robot, so if the drive is not armed, the drive has lost torque."""
     DAMP = 2

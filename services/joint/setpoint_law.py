@@ -156,7 +156,7 @@ class SetpointLaw:
             s.frozen, s.changed_ns = near, now_ns
 
     def _held(self, s: SetpointState, since_ns: int) -> Setpoint:
-        """Return HOLD's setpoint: the frozen one, with some gains rising to the stand gains."""
+        """Return HOLD's setpoint: the frozen one, with gains rising to at least HOLD's."""
         moving = max(0.0, 1.0 - since_ns / self._coupled_ramp_ns)
         risen = min(1.0, since_ns / self._stiffen_ns)
         frozen = pd_law.freeze(s.frozen, moving)

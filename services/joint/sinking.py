@@ -1,8 +1,8 @@
-"""DAMP: sinking of a module after an emergency stop, from the angles of its own leg. Pure.
+"""DAMP: sinking of a module after an emergency stop, using the angles of its own leg. Pure.
 
 Every phi holds. The theta axes of `damp_sinks` lose their stiffness and carry their load as
 feedforward that fades, so they sink slowly and never drop. A knee is caught at its stop, or at its
-present angle if another module does not go down. An ankle holds. As its knee folds, its reference
+present angle if another module stays up. An ankle holds. As its knee folds, the ankle's reference
 turns so that the hip joint, and with it the COM, stays as far ahead of the ankle as before:
 
     ahead = l2 sin(ankle) + l1 sin(ankle + knee)
@@ -11,8 +11,8 @@ A hip that knows the angles of ankle and knee holds the torso's attitude. A hip 
 them damps, and the torso turns with the thighs (`services.joint.neighbours`).
 
 A module that must stiffen for a limp module stops sinking. It holds its position with its support
-gains (`RobotConfig.support_gains`), and keeps its load as feedforward, even that of a stop's
-spring. A leg with a limp knee stands as a strut only on a stiff hip.
+gains (`RobotConfig.support_gains`), and keeps its load as feedforward, even the load on a
+stop's spring. A leg with a limp knee stands as a strut only on a stiff hip.
 """
 
 from __future__ import annotations

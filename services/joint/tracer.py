@@ -28,8 +28,8 @@ _UNTOLD: Final = (-1.0, -1.0)
 _Cycle = tuple[
     int, DriveReading | None, JointCommand | None, bool, DriveAction, NeighbourView, int, int, Pair
 ]
-"""A cycle's raw inputs and outcome. Converting ten at once is cheaper than converting one in each
-cold cycle."""
+"""A cycle's raw inputs and outcome. Converting ten at once is cheaper than converting one per cycle
+with cold caches."""
 
 
 class Tracer:

@@ -10,8 +10,8 @@ services can detect that, at 500 Hz. Each service monitors its torque and speed 
 
 The law's own torques stay below about 4 Hz (`GainSchedule.coupling_bandwidth_hz`). Shaking reached
 4 N m on simulated plants with every error drawn at random, while they were led and pushed with 75 %
-of the push that soles and motors bear. On drivetrains on which the robot falls if the coupled
-torque has no low-pass, it reaches 15 N m after 20 to 60 ms, and then 55 to 77 N m.
+of the push that soles and motors withstand. On drivetrains on which the robot falls if the coupled
+torque has no low-pass, shaking reaches 15 N m after 20 to 60 ms, and then 55 to 77 N m.
 """
 
 from __future__ import annotations

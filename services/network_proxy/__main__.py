@@ -1,6 +1,6 @@
 """`python -m services.network_proxy`: impairs the network between the services on purpose.
 
-Services dial it instead of each other (`--injected`); `xrl inject` controls it.
+Services dial the proxy instead of each other (`--injected`); `xrl inject` controls it.
 """
 
 from __future__ import annotations

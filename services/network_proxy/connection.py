@@ -20,12 +20,12 @@ from services.network_proxy.sockets import READ, WRITE, Ready, SocketWatch
 from shared.config.impairment import HELD, Direction, Impairer
 
 PENDING_MAX: Final = 262_144
-"""Maximum due bytes that wait for a slow receiver. Above it, the proxy stops reading the sender,
-which then blocks as on a direct link.
+"""Maximum due bytes that wait for a slow receiver. Above it, the proxy stops reading from the
+sender, which then blocks as on a direct link.
 """
 WAITING_MAX: Final = 4_194_304
-"""Maximum bytes that are not due yet, 10 s of states. Above it, the proxy stops reading the sender.
-"""
+"""Maximum bytes that are not due yet, 10 s of states. Above it, the proxy stops reading from the
+sender."""
 _READ: Final = 65_536
 _LENGTH: Final = struct.Struct("<H")
 _ID: Final = 0x1F  # low five bits of every header

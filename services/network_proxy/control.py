@@ -144,7 +144,7 @@ class ControlSocket:
         watch.want(self._listener.socket, READ, self._dialled)
 
     def close(self) -> None:
-        """Stop listening."""
+        """Drop all clients, and stop listening."""
         for asker in list(self._askers):
             self._leave(asker)
         self._watch.want(self._listener.socket, 0, self._dialled)

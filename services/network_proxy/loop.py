@@ -24,7 +24,7 @@ def run(
     impairments: ImpairmentSchedule,
     stop: StopFlag,
 ) -> None:
-    """Run until `stop`."""
+    """Run until `stop` is set."""
     while not stop:
         ready = watch.wait(_patience_s(relay, impairments))
         at_ns = now_ns()

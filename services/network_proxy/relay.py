@@ -1,4 +1,4 @@
-"""Relay between the ends of links, which forwards each batch when it is due."""
+"""Relay between the ends of links: forwards each batch when it is due."""
 
 from __future__ import annotations
 

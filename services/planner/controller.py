@@ -1,8 +1,8 @@
 """Interface of a custom controller, and its loader.
 
 A custom controller replaces the shipped law (docs/own-controller.md), and runs inside the planner:
-in lockstep, live and from the log. Everything around it stays active: the planner's stance, load,
-assist, engagement and trips; the certificate of the local gains
+live, in lockstep and in re-execution. Everything around it stays active: the planner's stance,
+load, assist, engagement and trips; the certificate of the local gains
 (`services.planner.watch.controller_guard`); the joint services' age rule, envelope and torque
 limits. Joints are in the order of `shared.joints`; the pose is p = [COM x y z; torso roll pitch
 yaw].
@@ -107,7 +107,7 @@ def split_spec(spec: str) -> tuple[Path, str]:
 
 
 def absolute(spec: str) -> str:
-    """Return the spec with its path made absolute."""
+    """Return the spec as `FILE.py:NAME`, with an absolute path."""
     path, name = split_spec(spec)
     return f"{path.absolute()}:{name}"
 

@@ -1,10 +1,10 @@
 """The operator's newest intent (`operator/intent`), which fades out once stale. Pure.
 
-An intent that is not repeated becomes stale: an operator who requested 100 N and left must not be
-lifted forever. It fades out slowly, because a person may still lean on the robot:
+An intent that is not repeated becomes stale: a request whose sender is gone must not lift the
+person forever. It fades out slowly, because the person may still lean on the robot:
 
     request = intent                                       younger than `assist.stale_ms`
-    request = intent max(0, 1 - (age - stale) / fade)      older; `sit` ends at once
+    request = intent max(0, 1 - (age - stale) / fade)      older; `sit` and `park` end at once
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shared.config.sections import AssistConfig
 
 
 class OperatorRequest(NamedTuple):
-    """Assist force and shift that the operator requests."""
+    """Operator's request: assist, shift, sit and park."""
 
     assist_n: float = 0.0
     shift: Vector4 = STRAIGHT

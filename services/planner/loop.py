@@ -73,7 +73,7 @@ class _Checkpoints:
         self._encode = msgspec.json.Encoder().encode
 
     def after(self, planner: Planner, now_ns: int) -> PlannerCheckpoint | None:
-        """Return the state after the tick just run, or None if it is not due."""
+        """Return the checkpoint after the tick just run, or None if it is not due."""
         self._tick += 1
         tick = self._tick
         first = tick < self._every and tick & (tick - 1) == 0

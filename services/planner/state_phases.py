@@ -70,7 +70,7 @@ class StatePhases:
         arrived_ns: Sequence[int],
         last_tick_ns: int,
     ) -> None:
-        """Compare the states of a tick, if all six are new.
+        """Advance by one tick: compare arrivals if all six states are new; finally choose phases.
 
         Args:
             state: state of the phases; updated in place.

@@ -140,7 +140,7 @@ def _about(writer: RunWriter, keys: int) -> str:
 
 def _arguments() -> argparse.Namespace:
     parser = service_parser(
-        "Record the bus into one MCAP file.", "python -m services.recorder --out out/run"
+        "Record the bus to MCAP files.", "python -m services.recorder --out out/run"
     )
     parser.add_argument("--out", type=Path, required=True, help=f"directory for {FIRST}")
     parser.add_argument(

@@ -64,7 +64,7 @@ class AutoRecovery(threading.Thread):
 def recover_in_place(
     path: Path, keep_free: int, logger: logging.Logger, stop: recover.Stop
 ) -> None:
-    """Recover one file, if it is unfinished and no process writes it.
+    """Recover one file, if it is unfinished, no process writes it and a copy has room.
 
     A file that was only cut off is replaced by its recovered copy once the copy is on the disk. If
     its middle is damaged too, the original stays, and the copy is put beside it. Raises RunError or

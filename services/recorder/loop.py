@@ -44,7 +44,7 @@ class Recorder:
         """Check the disk, and start the first file.
 
         `writer` must not have started a file; `free_bytes` returns the free space where the run is
-        written. Like all methods, it raises RunError if a file cannot be written.
+        written. Like all methods, this one raises RunError if a file cannot be written.
         """
         self._source, self._writer = source, writer
         self._logger, self._free_bytes = logger, free_bytes

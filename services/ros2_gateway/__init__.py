@@ -1,1 +1,1 @@
-"""ROS 2 gateway: publishes the robot to ROS 2 over Zenoh, without ROS on board (docs/ros2.md)."""
+"""ROS 2 gateway: publishes robot data to ROS 2 over Zenoh, without ROS on board (docs/ros2.md)."""

@@ -1,4 +1,4 @@
-"""`python -m services.ros2_gateway`: publishes the robot to ROS 2, and forwards accepted requests.
+"""`python -m services.ros2_gateway`: publishes robot data to ROS 2, and forwards accepted requests.
 
 Without `--accept` it only publishes.
 """
@@ -88,7 +88,7 @@ def main() -> int:
         process.freeze_garbage()
         if time.time_ns() > TIME_LAST_NS:
             logger.warning(
-                "this host's clock is past 2038-01-19, where ROS 2 timestamps end: correct it"
+                "this host's clock is past 2038-01-19, when ROS 2 timestamps end: correct it"
             )
         offset_ns = time.time_ns() - now_ns()
         deadline_ns = now_ns()

@@ -42,7 +42,7 @@ class RosTopics(NamedTuple):
 
 
 def topics_of(namespace: str) -> RosTopics:
-    """Return the topics of a robot in a namespace, such as `legs`, or in none."""
+    """Return the topics of a robot in a namespace, such as `legs`, or without one."""
     below = f"/{namespace}" if namespace else ""
     return RosTopics(
         RosTopic(f"{below}/joint_states", conversions.JOINT_STATE),
@@ -59,8 +59,8 @@ def topics_of(namespace: str) -> RosTopics:
 class Gateway:
     """Converts the robot's newest messages to ROS 2, at the rates of `config.ros2`.
 
-    Stale data is not repeated: joint states omit a silent module, and transforms then omit the
-    torso. For a simulated robot, the gateway also publishes the time.
+    Stale data is not repeated: joint states omit a module that is silent or has no valid angles,
+    and transforms then omit the torso. For a simulated robot, the gateway also publishes the time.
     """
 
     def __init__(self, config: RobotConfig, convert: Conversions, *, simulated: bool) -> None:

@@ -80,7 +80,7 @@ class Inbound:
     def intent(
         self, now_ns: int, number: int, status: PlannerStatus | None
     ) -> OperatorIntent | None:
-        """Return a new intent once; None if there is none, or if another operator is in control.
+        """Return a new intent once; None without one, or if another operator is in control.
 
         `number` becomes its sequence number; `status` shows whose intent the planner follows.
         """

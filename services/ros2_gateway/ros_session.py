@@ -21,7 +21,7 @@ NODE: Final = "xrl"
 """Name of the gateway's node."""
 _SETTINGS: Final[dict[str, object]] = {
     # A router forwards everything to a client, and the client redials a lost router. Peers cannot
-    # connect: this one listens nowhere, and those of ROS 2 listen on their own host's loopback.
+    # connect: this session does not listen, and the peers of ROS 2 listen only on their loopback.
     "mode": "client",
     "scouting/multicast/enabled": False,
     "connect/timeout_ms": 1000,
@@ -41,7 +41,7 @@ class RosSession:
     def __init__(
         self, router: str, domain: int, types: RosTypes, *, namespace: str = "", name: str = NODE
     ) -> None:
-        """Connect to the router; raise BusError if none answers within a second."""
+        """Connect to the router; raise BusError if it does not answer within a second."""
         config = zenoh.Config()
         for key, value in {**_SETTINGS, "connect/endpoints": [router]}.items():
             config.insert_json5(key, json.dumps(value))

@@ -26,7 +26,7 @@ def encode(message: Message) -> bytes:
 
     Raises:
         NonFiniteError: a number is NaN or infinite. msgspec writes it as null, which no message
-            type allows, because no field is optional.
+            type allows.
         EncodeError: a value has no JSON form, or an integer has more than 64 bits.
     """
     try:
@@ -62,7 +62,7 @@ class Decoder(Generic[M]):
         self.refused = 0
 
     def decode(self, payload: bytes) -> M | None:
-        """Return the message, or None if the payload is malformed, which is counted.
+        """Return the message, or count the payload and return None if it is malformed.
 
         null, NaN and infinities are malformed: null is not a float, and JSON has no literal for the
         others.

@@ -28,7 +28,7 @@ _HELP: Final = "make this host's keys with `xrl keys pack` (docs/security.md)"
 
 
 class Names(Section, frozen=True):
-    """Content of `names.toml`: the robot and its names."""
+    """Content of `names.toml`: the robot's name and the certified names."""
 
     robot: str
     generations: dict[str, int]
@@ -108,7 +108,7 @@ def read_credentials(robot: RobotConfig, process: str) -> Credentials:
 
 
 def require_operator(robot: RobotConfig, process: str) -> None:
-    """Check that this host has an operator's key under `mtls`; other modes identify no sender.
+    """Under `mtls`, check that this host has an operator's key; other modes identify no sender.
 
     Raises BusError if this host has no key, FleetError if the key is not an operator's.
     """
@@ -123,7 +123,7 @@ def require_operator(robot: RobotConfig, process: str) -> None:
 
 
 def check_private(key: Path) -> None:
-    """Raise BusError for a private key that belongs to another user or that others may read."""
+    """Raise BusError unless a private key belongs to this user, who alone can read it."""
     found = key.stat()
     if found.st_uid != os.geteuid():
         raise BusError(f"{key}: belongs to another user; the service's user must own it")

@@ -1,7 +1,7 @@
 """Every message on the bus (docs/networks.md).
 
 Payloads are JSON, encoded by msgspec, in SI units; times are integers in ns, and enumerations are
-integers. No field is optional, so a `null` in a payload is always a number that was not finite;
+integers. No field may be null, so a `null` in a payload is always a number that was not finite;
 `shared.bus.codec` refuses it on both sides.
 """
 
@@ -154,7 +154,7 @@ class DriveStatus(IntEnum):
     UNZEROED = 4
     """Both axes answer, but the zero is missing."""
     HOLDING = 5
-    """In closed loop since an earlier service, and not taken over."""
+    """Left in closed loop by an earlier service, and not taken over yet."""
     UNACKNOWLEDGED = 6
     """Lost; no node acknowledges frames."""
 
@@ -307,7 +307,7 @@ class JointState(Message, frozen=True):
     cycle: Int64
     """Cycles since the start."""
     late: Int64
-    """Cycles that began over two periods after the last."""
+    """Cycles that began more than two periods after the previous one."""
     dropouts: Int64
     """Recent dropouts."""
     refused: Int64
@@ -403,7 +403,7 @@ class Attitude(Message, frozen=True):
     """Attitude of the torso."""
 
     up: Vector3
-    """Unit vector against gravity, torso axes."""
+    """Unit vector opposite to gravity, torso axes."""
     rate: Vector3
     """Angular velocity, rad/s, torso axes."""
     valid: bool
@@ -442,7 +442,7 @@ class PlannerStatus(Message, frozen=True):
     p_ref: Vector6
     """Reference of `p`."""
     closure: Vector6
-    """Left minus right leg's estimate of the torso pose, m and rad, world."""
+    """Left leg's minus right leg's estimate of the torso pose, m and rad, world."""
     assist_n: float
     """Assist in the feedforward, plus the lift that stands the robot up."""
     margin: float
@@ -478,7 +478,7 @@ class PlannerStatus(Message, frozen=True):
     """Warnings about supply, harness and heat, and why the planner does not lead."""
     trip: Int64 = 0
     load: Vector3 = (0.0, 0.0, 0.0)
-    """Load beyond the robot file, kg; its moments, N m (`services.planner.law.load`)."""
+    """Load beyond that of the robot file, kg; its moments, N m (`services.planner.law.load`)."""
     requested_by: str = ""
     """Source of the intent in use; empty: none."""
     refused: Int64 = 0

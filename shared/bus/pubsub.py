@@ -197,7 +197,7 @@ class Stream:
 
 
 class Recording(Stream):
-    """Undecoded recorded messages, unpacked from their batches."""
+    """Undecoded messages for the log, unpacked from their batches."""
 
     def __init__(
         self, subscribers: Sequence[Subscriber], keys_by_batch: Mapping[str, Container[str]]

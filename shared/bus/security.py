@@ -96,7 +96,7 @@ def _mutual_tls(robot: RobotConfig, process: str) -> dict[str, object]:
 
 
 def listener(endpoint: str) -> str:
-    """Return a listening endpoint in Zenoh's form, with the timeout of its handshake."""
+    """Return a listening endpoint in Zenoh's form; for TLS, with a handshake timeout."""
     of_tls = endpoint.startswith("tls/")
     return f"{endpoint}#tls_handshake_timeout_ms={HANDSHAKE_MS}" if of_tls else endpoint
 
@@ -131,7 +131,7 @@ def access_control(
     policies, here = [], set(everybody)
     for name, generation in generations.items():
         own_rules = [
-            # By receiver: Zenoh sends a new peer everything until it knows its subscriptions.
+            # By receiver: Zenoh sends a peer everything until it knows that peer's subscriptions.
             _rule(f"to-{name}", "egress", ("put",), topics.keys_between(robot, own, name)),
             _rule(f"{name}-puts", "ingress", ("put",), topics.written_keys(robot, name)),
             _rule(f"{name}-subscribes", "ingress", _RECEIVED, topics.read_keys(robot, name)),

@@ -114,7 +114,7 @@ def _tables(proc_net: Path, *names: str) -> bytes:
 
 
 def _address(text: bytes) -> IpAddress:
-    """Return an address of /proc/net/tcp: words of 32 bits in the order of this machine."""
+    """Return an address of /proc/net/tcp: 32-bit words in this machine's byte order."""
     words = bytes.fromhex(text.decode())
     packed = b"".join(struct.pack(">I", word) for (word,) in struct.iter_unpack("=I", words))
     address = ipaddress.ip_address(packed)

@@ -60,9 +60,9 @@ def own_fault(own: Credentials) -> str:
 
 
 def refusal(own: Credentials, endpoint: str) -> str:
-    """Return why a link to tls/HOST:PORT fails, in words; "" if it does not.
+    """Return why a link to tls/HOST:PORT fails, in words; "" if it works.
 
-    Takes up to 1.3 s; not for a control loop.
+    May take seconds; not for a control loop.
     """
     host, port = host_and_port(endpoint)
     try:

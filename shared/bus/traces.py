@@ -103,7 +103,7 @@ class SimTruth(Message, frozen=True):
     """Angle between sole and floor, rad."""
     foot_left_tilt: float
     feet_slip: float
-    """Larger distance of an ankle from its initial position, m."""
+    """Distance of the farther ankle from its initial position, m."""
     hoist: float
     """Support by the hoist: 1 hanging, 0 free."""
     fallen: bool
@@ -112,7 +112,7 @@ class SimTruth(Message, frozen=True):
     late_s: float
     """Clock time that the simulation has skipped."""
     lean: Pair = (0.0, 0.0)
-    """Slope of the vertical against the floor's normal along x and y, m/m."""
+    """Slope of the vertical relative to the floor's normal along x and y, m/m."""
     foot_right_force: Vector3 = (0.0, 0.0, 0.0)
     """Force of the floor on the sole, N."""
     foot_left_force: Vector3 = (0.0, 0.0, 0.0)
@@ -189,7 +189,7 @@ class LinkEvent(Message, frozen=True):
     partition: bool
     """Nothing passes."""
     detail: str
-    """Impairment, as `--inject` writes it."""
+    """Impairment, in the syntax of `--inject`."""
     passed: Int64
     """Passed messages (live: Zenoh batches); 0 at the start."""
     lost: Int64

@@ -3,7 +3,7 @@
 These differ: heartbeat bytes 5 to 7; 0x000 (version); 0x003 (one pair of error words for the axis);
 0x004 and 0x005 (any endpoint, read and written); 0x019 (position in turns as a float, in 0.5 as
 counts); 0x018 (a byte that requests blinking); and the error numbers, such as the watchdog's
-0x0100_0000 (0x800 in 0.5). Set-points, limits, gains and estimates are as in 0.5.
+0x0100_0000 (0x800 in 0.5). Setpoints, limits, gains and estimates are as in 0.5.
 
 From 0.6.11 on, a drive confirms each write of an endpoint with 0x005, just as it answers a read.
 

@@ -1,7 +1,7 @@
-"""Settings that this robot needs on its ODrives: one table, by the names of firmware 0.5.6.
+"""Settings that this robot needs on its ODrives: one table, with the names of firmware 0.5.6.
 
 With factory settings an ODrive disarms, limits or answers in ways that make this robot fall
-(docs/drives.md#traps). The simulator configures its drives by this table, `xrl doctor` compares a
+(docs/drives.md#traps). The simulator configures its drives from this table, `xrl doctor` compares a
 drive with it, and `xrl drive configure` writes it, so the three cannot disagree.
 
 The joint services write some modes, gains and limits at arming or in every cycle. The table also
@@ -67,7 +67,7 @@ class _Setting(NamedTuple):
     wanted: Callable[[Need], Value | None]
     """Wanted value; None: any."""
     why: str
-    """Consequence of any other value."""
+    """Reason for the value, mostly the consequence of any other."""
     compare: Compare = Compare.EQUAL
 
 
@@ -120,7 +120,7 @@ AXIS_TABLE: Final[tuple[_Setting, ...]] = (
     _Setting("controller.config.enable_overspeed_error", lambda _: True,
         "a runaway motor would not be stopped"),
     _Setting("controller.config.enable_torque_mode_vel_limit", lambda _: False,
-        "in torque mode the torque would be limited by vel_gain; at vel_gain = 0 none is left"),
+        "in torque mode vel_gain would limit the torque; at vel_gain = 0, to zero"),
     _Setting("controller.config.spinout_electrical_power_threshold", lambda _: SPINOUT_POWER,
         "an axis that sinks under load with a warm winding disarms (SPINOUT_DETECTED)",
         Compare.AT_LEAST),

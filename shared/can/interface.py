@@ -2,8 +2,8 @@
 
 In Linux (net/can/raw.c, include/linux/can/skb.h, drivers/net/can/dev), a frame waits in the
 interface's queue (pfifo_fast, txqueuelen), where it is charged to its socket (SO_SNDBUF), then in
-the adapter, where it is not. Both queues outlive the socket, and neither drops a frame for its
-age. Taking the interface down drops all frames and resets the adapter. CAN sockets have no
+the adapter, where it is not. Both queues outlive the socket, and neither drops a frame because of
+its age. Taking the interface down drops all frames and resets the adapter. CAN sockets have no
 SIOCOUTQ, and SO_MEMINFO does not count the adapter's frames: only the echo of a sent frame
 (CAN_RAW_RECV_OWN_MSGS) shows that it was transmitted.
 """

@@ -105,7 +105,7 @@ class Interface:
         return int.from_bytes(self.memory[:FULL_AT], "little")
 
     def restart(self) -> None:
-        """Request the hub to discard all waiting frames."""
+        """Request that the hub discard all waiting frames."""
         count = self.restarts + 1 & 0xFFFF_FFFF
         self.memory[:FULL_AT] = count.to_bytes(FULL_AT, "little")
 
@@ -118,7 +118,7 @@ class UnixCanBus(can.BusABC):
     """Client of a `UnixCanHub`, declared to python-can as interface `xrl_unix`.
 
     Attributes:
-        dropped: frames that did not fit the queue; `send` raised ENOBUFS for each.
+        dropped: frames that were not sent: the queue was full, or the hub was gone.
         socket: its SO_SNDBUF limits the waiting frames, as on socketcan.
     """
 

@@ -178,7 +178,8 @@ def _imu(config: RobotConfig) -> Problems:
     for module in config.module:
         if config.can[module.bus].channel == channel:
             right = (
-                "use a bus without drives: the IMU's frames 0x11, 0x21 and 0x32 are nodes 0 and 1"
+                "use a bus without drives: the IMU's ids 0x11, 0x21 and 0x32 are those of nodes "
+                "0 and 1"
             )
             yield "imu.bus", f"{imu.bus!r} is also the bus of {module.name}", right
 
@@ -292,7 +293,7 @@ def _drive(config: RobotConfig) -> Problems:
     speed = config.joint_service.v_max * turns_per_rad
     if drive.vel_limit < speed:
         found = f"{drive.vel_limit:g} turn/s is slower than joint_service.v_max"
-        right = f"must be at least {speed:.1f} turn/s, v_max at the motor; above it a drive disarms"
+        right = f"must be at least {speed:.1f} turn/s, v_max at the motor; a faster drive disarms"
         yield "drive.vel_limit", found, right
     kind, turns = max(((kind, _turns(config, kind)) for kind in KINDS), key=lambda row: row[1])
     least = 2 * (turns + _POWER_UP_TURNS)

@@ -1,8 +1,9 @@
 """Seeded model of a bad network: delay, jitter, loss, partitions. Pure.
 
-Terms are tc-netem's, if it has them. Lockstep's modelled network and the network proxy on the wire
-use the same class, so both behave alike (docs/networks.md). In lockstep it acts on messages; on the
-wire it acts on Zenoh's batches, so messages that are sent together travel, or are lost, together.
+Terms are those of tc-netem, where it has them. Lockstep's modelled network and the network proxy on
+the wire use the same class, so both behave alike (docs/networks.md). In lockstep it acts on
+messages; on the wire it acts on Zenoh's batches, so messages that are sent together travel, or are
+lost, together.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Impairment(Section, frozen=True, kw_only=True):
     delay_ms: Ms = 0.0
     jitter_ms: Ms = 0.0
     """uniform: the delay varies by +- jitter; normal, pareto: jitter is its standard deviation. A
-    negative delay counts as none."""
+    negative delay counts as zero."""
     distribution: Distribution = "uniform"
     loss: Share = 0.0
     """Probability that a message is lost."""
@@ -53,7 +54,7 @@ class Impairment(Section, frozen=True, kw_only=True):
     """Nothing passes."""
 
     def describe(self) -> str:
-        """Return the impairment as `--inject` writes it: `delay=30ms loss=20%`, or `nothing`."""
+        """Return the impairment in `--inject`'s syntax, `delay=30ms loss=20%`, or `nothing`."""
         words = [
             f"{name}={_digits(value, places)}{unit}"
             for name, value, standard, places, unit in (
@@ -172,7 +173,7 @@ class Impairer:
         return release_ns
 
     def _spread(self) -> float:
-        """Return a draw: uniform in -1..1, else of mean 0 and standard deviation 1."""
+        """Return a draw: uniform in -1..1, or with mean 0 and standard deviation 1."""
         if self.what.distribution == "normal":
             return self._random.gauss(0.0, 1.0)
         if self.what.distribution == "pareto":
@@ -180,7 +181,7 @@ class Impairer:
         return self._random.uniform(-1.0, 1.0)
 
     def _is_lost(self) -> bool:
-        """Return whether the next message is lost; with bursts a chain of two states."""
+        """Return whether the next message is lost; bursts follow a chain of two states."""
         what = self.what
         if what.burst <= 1.0:
             return self._random.random() < what.loss

@@ -40,7 +40,7 @@ class Keyframe(Section, frozen=True):
     height: Annotated[float, Range(0.3, 2.0, "m")]
     pitch: Annotated[float, Range(-1.5, 1.5, "rad")] = 0.0
     assist: Annotated[float, Range(0.0, 500.0, "N")] = 0.0
-    """Weight that the operator rests on the harness and requests the robot to carry, N."""
+    """Weight that the operator rests on the harness and asks the robot to carry, N."""
     shift: tuple[ShiftLength, ShiftLength, ShiftAngle, ShiftAngle] = (0.0, 0.0, 0.0, 0.0)
     """Requested offset of COM x and y, m, and of the torso's roll and yaw, rad."""
     side: ShiftLength | None = None
@@ -141,7 +141,8 @@ FAULT_KINDS: Final[Mapping[str, _FaultTraits]] = {
     ),
     "bus_flap": _FaultTraits("the bus is dead for 60 ms of each 150 ms", 2.0, whole=True),
 }
-"""Faults by name. An axis that disarms floats; its sibling keeps its torque."""
+"""Faults by name. An axis that disarms floats; its sibling keeps its torque until the service
+idles it."""
 
 
 class Fault(Section, frozen=True):
@@ -217,7 +218,7 @@ class Lead(NamedTuple):
 def lead(scenario: Scenario, t: float) -> Lead:
     """Return the hand's target at scenario time t, s.
 
-    Before the first keyframe and after the last, this is that keyframe.
+    Before the first keyframe and after the last, this is that keyframe's target.
     """
     frames = scenario.keyframe
     for a, b in pairwise(frames):

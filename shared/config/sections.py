@@ -149,7 +149,7 @@ class CertificateConfig(Section, frozen=True):
 
 
 class RobustnessConfig(Section, frozen=True):
-    """Model errors with which the loop must be stable (docs/law.md#flexible-joints)."""
+    """Model errors under which the loop must be stable (docs/law.md#flexible-joints)."""
 
     stiffness: tuple[Annotated[float, Range(500.0, 1e6, "N m/rad")], ...]
     """Drivetrain stiffnesses between motor and joint; 1e6 is rigid."""
@@ -192,7 +192,7 @@ StillTime = Annotated[float, Range(0.1, 5.0, "s")]
 
 
 class WearerThresholds(Section, frozen=True):
-    """All thresholds of park for one person, which `xrl log wearer` measures."""
+    """All park thresholds for one person, as `xrl log wearer` measures them."""
 
     open_n: OpenForce
     open_back_nm: OpenMoment
@@ -256,7 +256,7 @@ class JointServiceConfig(Section, frozen=True):
     hold_stiffens_theta: tuple[Literal["ankle", "knee", "hip"], ...]
     """In HOLD the gains of every phi, and of theta in these modules, rise to the stand gains."""
     damp_sinks: tuple[Literal["ankle", "knee", "hip"], ...]
-    """In DAMP the theta of these sinks, and every phi holds."""
+    """In DAMP the theta of these modules sinks, and every phi holds."""
     torque_rate_max: Annotated[float, Range(100.0, 1e6, "N m/s")]
     soft_stop_k_p: LocalStiffness
     k_p_max: LocalStiffness
@@ -268,11 +268,11 @@ class JointServiceConfig(Section, frozen=True):
     """Gains of the hips' theta while a knee is limp and its leg stands as a strut; optional."""
     stiffen_ms: Milliseconds = 300.0
     """Rise time of the gains in HOLD and beside a limp module."""
-    # at 300 ms a led robot fell under a sideways lean that was 10 N smaller
+    # at 300 ms (shipped: 100 ms) a led robot fell under a sideways lean 10 N smaller
 
 
 class EnvelopeConfig(Section, frozen=True):
-    """Limits of accepted commands, in addition to the gain schedule's bounds."""
+    """Limits on accepted commands, in addition to the gain schedule's bounds."""
 
     tau_ff_margin: Annotated[float, Range(0.0, 200.0, "N m")] = 20.0
     q_ref_distance: Annotated[float, Range(0.01, 2.0, "rad")] = 0.2
@@ -284,7 +284,7 @@ class EnvelopeConfig(Section, frozen=True):
     tau_coupled: Annotated[float, Range(1.0, 1e3, "N m")] = 60.0
     coupled_work: Annotated[float, Range(0.01, 1e3, "J")] = 1.0
     """Maximum of coupled torque times deflection, if the torque points away from the reference."""
-    # the law's own: 0.1 J on plants pushed as hard as soles and motors withstand, 0.6 J in a fall
+    # the law reaches 0.1 J on plants pushed as hard as soles and motors withstand, 0.6 J in a fall
     coupled_energy: Annotated[float, Range(0.01, 1e3, "J")] = 10.0
     """Maximum work of the coupled torque on moving joints within about 0.3 s
     (docs/results.md#wrong-planners)."""
@@ -424,7 +424,7 @@ class SupplyConfig(Section, frozen=True):
 
 
 LOST_S: Final = 0.1
-"""Silence after which a drive without a watchdog is lost, s. In DAMP a knee holds if any module of
+"""Silence after which a drive without a watchdog is lost, s. In DAMP a knee holds if any module on
 its host was silent for this time, even with a watchdog (`services.joint.neighbours`)."""
 
 

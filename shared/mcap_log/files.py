@@ -89,11 +89,10 @@ class FsyncThread:
         self._error: OSError | None = None
 
     def request(self, descriptor: int, *, last: bool = False) -> None:
-        """Request the sync of a file, which may be closed after this, and return at once.
+        """Request the sync of a file and return at once; the file may then be closed.
 
-        A request is skipped while another one waits, whose sync covers both, unless it is the
-        `last` of this file. Raises OSError if an earlier sync failed: written data may not be on
-        the disk.
+        Unless it is the `last` of this file, a request is skipped while another one waits. Raises
+        OSError if an earlier sync failed: written data may not be on the disk.
         """
         with self._wake:
             self._raise()

@@ -134,7 +134,7 @@ class LogReader:
         self.in_summary: Counter[int] = Counter()
         """Number of records in the summary, by opcode."""
         self.message_count: int | None = None
-        """Number of messages by the summary's statistics; None if these are missing or damaged."""
+        """Number of messages in the summary's statistics; None if these are missing or damaged."""
         self._encodings: dict[int, str] = {}
         self._vouched = 0
         """Offset up to which records of unknown kinds are known to lead to a known one."""
@@ -203,7 +203,7 @@ class LogReader:
     def read_at(self, start: int) -> LogRecord | None:
         """Return the record at a place that `skim` found; None if it is damaged.
 
-        Raises RunError if all records read so far are far larger than in any run of this file size.
+        Raises RunError if the records read so far are far larger than in any run of this file size.
         """
         damage, self.damage = self.damage, []
         record, _ = self._next(start)
@@ -237,7 +237,7 @@ class LogReader:
         return ChunkPlace(at, first_ns, last_ns, frozenset(channels) or None), following
 
     def _indices(self, at: int) -> Iterator[tuple[int, bytes, int]]:
-        """Yield each message index from a place on: its channel, its entries, its end."""
+        """Yield each message index from an offset on: its channel, its entries, its end."""
         while True:
             opcode, start, end = self._extent(at)
             start += _INDEX_HEAD.size
@@ -399,7 +399,7 @@ class LogReader:
                 self._encodings[value.id] = value.message_encoding
 
     def _lost(self, start: int, following: int | None, first_ns: int = 0, last_ns: int = 0) -> int:
-        """Record a loss of bytes up to the next readable ones; return the offset of those."""
+        """Record a loss of bytes up to the next readable ones; return their offset."""
         end = self._end if following is None else following
         loss = LostBytes(start, end, first_ns, last_ns)
         if end < self._end or self.finished:
@@ -416,7 +416,7 @@ class LogReader:
         return opcode in KNOWN and (end <= self._end or end - start <= DECOMPRESSED_MAX)
 
     def _extent(self, at: int) -> tuple[int, int, int]:
-        """Return the opcode of the record at a place, and where its content begins and ends.
+        """Return the opcode of the record at an offset, and where its content begins and ends.
 
         The opcode is 0, and the end beyond the data's, if the data ends within its prefix.
         """

@@ -90,7 +90,7 @@ class ImpairmentSchedule:
         return True
 
     def clear(self, link: str, now_ns: int) -> int:
-        """End every impairment that affects a link, started or not; return their number."""
+        """End all impairments that affect a link, started or not; return their number."""
         names = set(directions_of(link))
         found = [n for n, row in self.requested.items() if names & set(directions_of(row.link))]
         for number in found:

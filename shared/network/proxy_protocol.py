@@ -41,7 +41,7 @@ class RequestedImpairment(msgspec.Struct, frozen=True):
     number: int
     link: str
     detail: str
-    """The impairment, as `--inject` writes it."""
+    """The impairment, in the syntax of `--inject`."""
     left_s: float | None
     """Time until it ends, s; None: no end."""
     passed: int

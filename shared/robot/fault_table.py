@@ -155,7 +155,8 @@ LOSSES: Final[dict[str, _LossRow]] = {
         "detects no overload and no HARNESS, SAGGING or UNATTENDED trip; an active overload, "
         "HARNESS or SAGGING trip stays",
         "harness/wrench: not valid",
-        "automatic; what stayed ends when the harness is back, or with `xrl kill planner`",
+        "automatic; an overload or trip that stayed ends when the harness is back, or with "
+        "`xrl kill planner`",
     ),
     "IMU lost, where one is fitted": _LossRow(
         "nothing",
@@ -217,4 +218,4 @@ def recovery_of(cause: Cause) -> str:
         return "repair power or cable (after a loss of power, run xrl drive zero)"
     if cause is Cause.POSITION_LOST:
         return "hang the robot, repair the encoder, run xrl drive zero"
-    return "hang the robot, find out why it disarmed"
+    return "hang the robot, find out why the drive disarmed"

@@ -15,7 +15,7 @@ class Support(IntEnum):
 
     HOLD leaves the hips' theta as soft as the planner set it, because the hand may keep leading
     (`RobotConfig.hold_gains`). With soft hips and knees a leg with a limp knee folds: the robot
-    fell at every phase of the squat. With stiff hips and knees the thigh is fixed to the torso and
+    fell in every phase of the squat. With stiff hips and knees the thigh is fixed to the torso and
     the leg is a strut: in the squat no robot fell (`tests/lockstep/test_faults.py`), even when
     pushed with 30 N. In the crawl, under the hand's pitch moment of 60 N m, the robot withstood a
     forward push of 20 N but not of 30 N. The stiff modules use their stand gains, except for the
@@ -30,7 +30,7 @@ class Support(IntEnum):
         squat, ankle limp      4      2    0
         crawl, ankle limp     12      6   12
 
-    For a limp hip no module stiffens: the other hip carries the torso.
+    If a hip is limp, no module stiffens: the other hip carries the torso.
     """
 
     NONE = 0

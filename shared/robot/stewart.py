@@ -9,7 +9,7 @@ base to platform.
 Everything is in torso axes, relative to the harness point, which is assumed to be the platform's
 centre. The sensor's axis is assumed to be the torso's x, with the operator in front. The layout is
 the usual 6-6 hexapod: three pairs of points on each circle, the platform's pairs turned by 60
-degrees against the base's, and each leg from its base point to the nearest platform point. At a
+degrees relative to the base's, and each leg from its base point to the nearest platform point. At a
 half angle of 30 degrees inside a pair, both hexagons are regular and alike, and the platform can
 twist freely (singular).
 """

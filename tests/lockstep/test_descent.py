@@ -151,7 +151,7 @@ def test_with_nothing_to_bear_it_it_holds_and_says_what_helps() -> None:
     """Idled there it tips: the torso meets the floor at 2.8 m/s, as from a stand."""
     found = go_down(ROBOT, alone(), wait_s=1.0)
     assert found.sinking < 0.2
-    assert "still bear weight: the legs carry 9" in found.lockstep.error
+    assert "still carry the robot: the legs carry 9" in found.lockstep.error
     assert "stand under its torso" in found.lockstep.error
     assert Ask.IDLE not in found.lockstep.asks
     assert found.height[-1] < 0.85
@@ -163,7 +163,7 @@ def test_a_robot_without_its_payload_is_not_taken_for_a_hanging_one() -> None:
     led = with_law(ROBOT, load_correction=(0.0, 0.0))  # whatever it carries
     light = changed(PlantConfig(), {"body.payload_scale": 0.0})
     found = go_down(led, alone(kill=kill(0.1)), light, wait_s=1.0)
-    assert "still bear weight: the legs carry" in found.lockstep.error
+    assert "still carry the robot: the legs carry" in found.lockstep.error
     assert found.lockstep.asks == [Ask.NOTHING, Ask.STOP, Ask.NOTHING]
     assert LIGHT_FRACTION < 0.5, "what it still bears"
 

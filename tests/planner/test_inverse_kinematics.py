@@ -220,4 +220,6 @@ def test_too_high_names_how_far_it_goes_and_which_joints_stop_it(ik: ReachSolver
     beyond.q[:] = stand_pose(ROBOT, 1.188)
     reach = beyond.solve_from_anywhere(TOO_HIGH)
     assert (reach.outcome, set(reach.stopped)) == (IkEnding.OUT_OF_REACH, {0}), "straight legs"
-    assert describe(reach, TOO_HIGH, wide).endswith("reach no further, no joint is at its limit")
+    assert describe(reach, TOO_HIGH, wide).endswith(
+        "reach no further, and no joint is at its limit"
+    )

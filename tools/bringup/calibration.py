@@ -2,7 +2,8 @@
 
 A board first restarts, which clears its errors and idles both axes. The `pre_calibrated` marks are
 written and saved once all axes are done. If the calibration fails or is aborted, the board restarts
-again to discard partial results, which it would treat as complete (docs/drives.md#traps).
+once the axis is idle, to discard partial results, which it would treat as complete
+(docs/drives.md#traps).
 """
 
 from __future__ import annotations
@@ -197,15 +198,15 @@ def calibrate_board(
     """Calibrate axes of a board in turn, mark and save them; after a failure, save nothing.
 
     Args:
-        board: idle board; it restarts before and after.
+        board: idle board; it restarts before and, unless an axis stays active, after.
         axes: "axis0", "axis1" or both.
-        interrupts: polled; a signal ends the calibration, idles the axis, and nothing is saved.
+        interrupts: polled; a signal ends the calibration and idles the axis, and nothing is saved.
         progress: see `Progress`.
         clock: monotonic, s.
         pause: sleeps for a time, s.
     """
     board.restart()
-    # only CAN feeds a watchdog, which would end the calibration
+    # nothing feeds the watchdogs over USB, so they would end the calibration
     watchdogs = board.read([f"{axis}.{_WATCHDOG}" for axis in AXES])
     board.write(dict.fromkeys(watchdogs, False))
     board.clear_errors()
@@ -404,7 +405,8 @@ def calibrate(
 ) -> int:
     """Ask the person, and calibrate one module after another; return the exit code.
 
-    After a failed module the next one is calibrated, unless the failed one is not idle.
+    After a failed module the next one is calibrated, unless the failed one is not idle or a signal
+    arrived.
 
     Args:
         console: for questions and results.
@@ -467,9 +469,7 @@ def tell(console: Console, robot: RobotConfig, module: str, result: BoardResult)
         if result.not_idle:
             console.print(marked("[bold red]{}: {}[/]", module, NOT_IDLE))
         else:
-            console.print(
-                "the board has restarted with the settings that it has stored, without a zero"
-            )
+            console.print("the board has restarted with its stored settings, without a zero")
         return False
     values = {f"{axis}.encoder.is_ready": True for axis in result.found} | {
         f"{axis}.{DIRECTION}": each.direction for axis, each in result.found.items()

@@ -279,7 +279,7 @@ def harness_rows(robot: RobotConfig, traffic: BusTraffic) -> list[Finding]:
         found, wanted = f"{traffic.frames} other frames", f"{harness.rate_hz:g} Hz"
         return [wrong(subject, what, found, wanted, fix, why)]
     largest = max(abs(force) for sample in cells.samples for force in sample)
-    good = largest < harness.leg_force_max  # NaN is not
+    good = largest < harness.leg_force_max  # False for NaN
     fix = "unload the harness; if the reading stays, a load cell or its wire is broken"
     found, limit = f"{largest:.0f} N", f"< {harness.leg_force_max:g} N"
     rate_fix = "set the amplifier's rate, or `harness.rate_hz`"
@@ -316,7 +316,7 @@ def _closed(robot: RobotConfig, subject: str, name: str, traffic: BusTraffic) ->
     if bus.interface == SIMULATED_CAN:
         fix = "this fleet's simulator has ended: see `xrl status`, or run `xrl down` and `xrl up`"
     elif bus.interface != "socketcan":
-        fix = f"check adapter and driver of python-can's {bus.interface} on {bus.channel}"
+        fix = f"check the adapter, and python-can's driver {bus.interface} on {bus.channel}"
     elif os.strerror(errno.EAFNOSUPPORT) in trouble:
         fix = "`sudo modprobe can_raw`: this kernel has no CAN (a container or a minimal kernel)"
     else:

@@ -91,7 +91,7 @@ def settings_rows(module: str, wanted: tuple[WantedSetting, ...], values: Values
         words = setting.describe()
         if not isinstance(value, bool | int | float):
             rows.append(
-                warning(subject, name, "missing", words, "needs firmware 0.5.6", setting.why)
+                warning(subject, name, "missing", words, "flash firmware 0.5.6", setting.why)
             )
         elif not setting.fits(value):
             by_hand = CALIBRATE if name.endswith("pre_calibrated") else fix
@@ -233,7 +233,7 @@ def _voltage(module: str, volts: float, trip_levels: tuple[float, float]) -> Fin
 
 
 def trip_levels_of(values: Values) -> tuple[float, float]:
-    """Return a board's under- and overvoltage trip levels, V."""
+    """Return a board's under- and overvoltage trip levels, V; DriveError if they are swapped."""
     low, high = (
         number(values, f"config.dc_bus_{name}voltage_trip_level") for name in ("under", "over")
     )

@@ -34,7 +34,7 @@ from tools.keys.inspection import inspect_keys
 MACHINE: Final = "machine"
 CPUS_MIN: Final = 2
 CPUS_FOR_1_KHZ: Final = 4
-"""Minimum numbers of processors, at 500 Hz and at 1 kHz (docs/results.md)."""
+"""Minimum numbers of processors, with joint services at 500 Hz and at 1 kHz (docs/results.md)."""
 CLOCKS: Final = ("tsc", "arch_sys_counter", "kvm-clock")
 """Clock sources that can be read without a system call."""
 ODRIVE_VENDOR: Final = "1209"
@@ -63,8 +63,8 @@ Links = Mapping[str, Mapping[str, Any]]
 
 QUEUE: Final = (32, 100)
 """Valid lengths of a send queue, frames. The kernel's default is 10; deploy/udev/92-can.rules sets
-64 and says why. Sending more than 100 frames takes longer than a joint service waits for a frame
-(`bus_watch.STUCK_MS`)."""
+64 and says why. Sending more than 100 frames may take longer than a joint service waits for a
+frame (`bus_watch.STUCK_MS`)."""
 _IP: Final = ("ip", "-details", "-json", "link", "show", "type", "can")
 _IP_S = 2.0
 _IFF_UP = 1
@@ -76,7 +76,7 @@ FILE: Final = "robot file"
 
 
 def machine_rows(robot: RobotConfig, root: Path = Path("/")) -> list[Finding]:
-    """Check the computer. Tests pass another root of the file system."""
+    """Check the computer and, for real drives, USB and CAN. Tests pass another file system root."""
     emulated = is_simulated(robot)
     rows = [_cpus(), _real_time(emulated=emulated), *_delays(root, emulated=emulated)]
     # only a warning, because interpreted graphs are slower but correct
@@ -138,7 +138,7 @@ def _delays(root: Path, *, emulated: bool) -> list[Finding]:
          "performance", "`sudo cpupower frequency-set -g performance`",
          "cycles are late on a processor at a low frequency"),
         (clock in ("", *CLOCKS), "clock source", clock or "unknown here", f"{CLOCKS[0]} or similar",
-         "find in the kernel's log why the kernel rejected tsc",
+         "look in the kernel's log for the reason why it rejected tsc",
          "every read of the clock costs a system call"),
         (synchronised, "wall clock", "synchronised" if synchronised else "not synchronised",
          "synchronised", CLOCK_FIX,
@@ -201,7 +201,7 @@ def _text(path: Path) -> str:
 
 
 def query_ip() -> Links:
-    """Return the output of `ip` for the CAN interfaces, or nothing without `ip`."""
+    """Return the output of `ip` by CAN interface; empty if `ip` is missing or fails."""
     try:
         output = subprocess.run(_IP, capture_output=True, timeout=_IP_S, check=True).stdout
         return {link["ifname"]: link for link in json.loads(output or "[]") if "ifname" in link}
@@ -237,7 +237,7 @@ def up_command(name: str) -> str:
 
 
 def _details(root: Path, name: str, link: Mapping[str, Any]) -> list[Finding]:
-    """Judge an interface that is up by the output of `ip`, as far as it reports values."""
+    """Judge an interface that is up, from the values that `ip` reports."""
     data = link.get("linkinfo", {}).get("info_data", {})
     again = f"`sudo ip link set {name} down`, then {up_command(name)}"
     rows = []
@@ -288,7 +288,7 @@ def _restart_rows(root: Path, name: str) -> list[Finding]:
     if len(allowed) < len(capabilities):
         return []  # a process has ended, or this is not Linux
     fix = "run them from the unit of `xrl hosts`, or grant CAP_NET_ADMIN (docs/drives.md)"
-    why = "a dozen frames survive a power cut in the queue, and then reach the drive"
+    why = "about a dozen frames wait in the queue during a power cut, and then reach the drive"
     found = "allowed" if all(allowed) else "not allowed"
     what = "restart by the services"
     return [advised(all(allowed), name, what, found, "allowed", fix, why)]
@@ -314,7 +314,7 @@ def robot_rows(robot: RobotConfig, path: Path) -> list[Finding]:
 
 
 def services_up(robot: RobotConfig, run_dir: Path) -> tuple[str, ...]:
-    """Return the services that listen on their endpoints, started by any user or program."""
+    """Return the services that listen on their endpoints, of any user or program."""
     here = security.services_here(robot)
     return tuple(
         service

@@ -164,7 +164,7 @@ def drives_within_reach(
 
 
 def _await_simulator(robot: RobotConfig, run_dir: Path, seconds: float) -> None:
-    """Wait until an emulated robot's load cells send, which shows that the simulator runs."""
+    """Wait at most `seconds` for frames of an emulated robot's load cells: its simulator runs."""
     config = bus_config(robot, robot.harness.bus, RunDir(run_dir).path)
     until = time.monotonic() + seconds
     while time.monotonic() < until:

@@ -41,7 +41,7 @@ class Finding(msgspec.Struct, frozen=True):
     fix: str = ""
     """Remedy; commands in backquotes."""
     why: str = ""
-    """Consequence if it is not fixed."""
+    """Consequence if it is not fixed, or a possible cause."""
 
 
 Groups = dict[str, list[Finding]]
@@ -171,7 +171,7 @@ def show(console: Console, groups: Groups, *, verbose: bool) -> None:
 
 
 def verdict_line(groups: Groups) -> str:
-    """Return the verdict in one line: "all ok", or the number of findings and their names."""
+    """Return the verdict in one line: "all ok", or the counts and names of bad rows."""
     report = report_of(groups)
     warnings = report.warnings
     noted = f"{warnings} warning{'s' * (warnings != 1)}: {_names(groups, FindingKind.WARNING)}"

@@ -59,7 +59,7 @@ def leg_of(*modules: str) -> tuple[str, ...]:
 def why_resting(robot: RobotConfig, q: Mapping[str, Pair]) -> str:
     """Return why a leg cannot hang free at q, rad, or "".
 
-    A limp joint that gravity would move rests on something.
+    A limp hip that gravity would move rests on something; other joints are not judged.
 
     Args:
         robot: robot file.
@@ -148,7 +148,7 @@ def leg_scores(robot: RobotConfig, q_knee: Array, q_hip: Array, upright: Upright
 
 
 def implied_up(robot: RobotConfig, q_knee: Array, q_hip: Array) -> Array:
-    """Return up in torso axes (n, m, 3), if the leg's centre of mass is below its hip."""
+    """Return up in torso axes (n, m, 3), assuming that the leg's COM is below its hip."""
     up: Array = -np.einsum("hij,kj->khi", rotations(q_hip), _leg_down(robot, q_knee))
     return up
 
@@ -181,9 +181,10 @@ def rotations(q: Array) -> Array:
 
 
 def _knee_scores(robot: RobotConfig, q: Array) -> Array:
-    """Score knees (n, 2) by the torque that friction or a stop must hold; up to 1 is plausible.
+    """Score knees (n, 2) by the torque that friction must hold; up to 1 is plausible.
 
-    The thigh swings as the knee bends, so the shin moves by only a third of the knee's angle.
+    Stops hold any torque. The score is inf if the thigh is too far from the vertical. The thigh
+    swings as the knee bends, so the shin moves by only a third of the knee's angle.
     """
     down = _leg_down(robot, q)
     l1, l2 = robot.geometry.l1, robot.geometry.l2

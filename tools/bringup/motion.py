@@ -1,7 +1,7 @@
 """A small motion of one axis, out and back, by the drive's own loop: plan, limits and guards. Pure.
 
 Law, torque limiter and drive targets are those of the joint service, so a sign that is right here
-is right there. Only the torque limit differs: the drive's own current limit enforces the plan's,
+is right there. Only the limits of torque and speed differ: the drive itself enforces the plan's,
 even if this process dies. `motion_runner` has the clock and the drives.
 """
 

@@ -157,7 +157,10 @@ def hanging_angles(
     *,
     until_still: bool = True,
 ) -> dict[str, Pair] | None:
-    """Return the modules' angles (phi, theta), rad, once they rest; None if interrupted."""
+    """Return the modules' angles (phi, theta), rad, or None if interrupted.
+
+    With `until_still`, they are returned once the modules rest.
+    """
     begin = still_since = clock()
     rest: dict[str, Pair] = {}
     while True:

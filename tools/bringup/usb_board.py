@@ -102,11 +102,11 @@ class UsbBus:
             )
         result = await self._connect(serial)
         if isinstance(result, str):
-            raise DriveError(f"ODrive {serial} restarted, but cannot be connected: {result}")
+            raise DriveError(f"ODrive {serial} restarted, but the connection failed: {result}")
         return result
 
     async def _watch(self) -> Subscription:
-        """Start to keep `_present` up to date."""
+        """Subscribe to boards that come and go, to keep `_present` up to date."""
         delegate: Any = DeviceManagerDelegate()
         delegate.on_found_device = self._on_found
         delegate.on_lost_device = self._on_lost
@@ -138,7 +138,7 @@ class UsbBus:
         return await asyncio.gather(*(self._connect(serial) for serial in serials))
 
     async def _connect(self, serial: str) -> RuntimeDevice | str:
-        """Return a board, or why it cannot be connected."""
+        """Return a board, or why the connection failed."""
         device = self._present.get(serial)
         if device is None:
             return "not plugged in"

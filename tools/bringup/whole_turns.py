@@ -18,7 +18,7 @@ away. Four kinds of evidence select the pose:
 
 A pose is accepted if friction and model errors explain its deviation, and the second-best pose
 deviates by at least `CLEAR` times what they explain. Otherwise the joint is refused, because with a
-wrong number of turns the robot falls, and measuring with a protractor takes only a minute.
+wrong number of turns the robot would fall, and measuring with a protractor takes only a minute.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from tools.bringup.hanging_leg import BEYOND, Upright, angle, implied_up, leg_sc
 CLEAR: Final = 1.5
 """Minimum error of the second-best pose, as a multiple of the explained error."""
 READS_ZERO: Final = 1e-4
-"""Distance from 0 within which an encoder may be stuck at 0, turns: two counts of 16384."""
+"""Distance from 0 within which an encoder may be stuck at 0, turns: 1.6 counts of 16384."""
 UNMOVED: Final = 0.0015
-"""Maximum change of both encoders' angles if a joint has not moved, turns: 0.3 mrad at the joint,
+"""Maximum change of both encoders' angles if a joint has not moved, turns: 0.5 mrad at the joint,
 more than temperature changes an encoder's error. A moved joint is this close by chance once in
 110 000 times."""
 BESIDE_MOVED: Final = 0.2
@@ -54,7 +54,7 @@ MEASURED: Final = 0.08
 LEGS_APART: Final = 0.1
 """Maximum angle between the up directions found from the two legs, rad."""
 
-UNTOUCHED: Final = "no encoder, magnet, motor or encoder cable has been touched since its zero"
+UNTOUCHED: Final = "no encoder, magnet, motor or encoder cable has been touched since zeroing"
 SWING: Final = "let it swing (--swing)"
 PROTRACTOR: Final = "zero it with a protractor (--at), as on the first day"
 ROUGHLY: Final = (
@@ -321,10 +321,11 @@ def _measured(about: Pair, poses: Array) -> Decision:
 
 
 def _moved(evidence: ModuleEvidence, unmoved: float) -> str | None:
-    """Return None if a joint is within `unmoved` turns of its rest, else a fault, or "" for motion.
+    """Return None if a joint is within `unmoved` turns of its rest, else a fault or "".
 
-    A joint that moves turns both motors. If only one encoder's angle changed, this encoder was
-    exchanged or slipped. If the encoders read each other's angles, their cables are swapped.
+    The result is "" if the joint has moved, or its rest is unknown. A joint that moves turns both
+    motors. If only one encoder's angle changed, this encoder was exchanged or slipped. If the
+    encoders read each other's angles, their cables are swapped.
     """
     if evidence.rest is None:
         return ""

@@ -185,7 +185,7 @@ def why_stranger(
     for name, before in zero.identity.calibration.items():
         now = identity.calibration.get(name)
         if not equal(now, before):
-            return f"it was calibrated since its zero: {name} is {now}, but was {before}"
+            return f"it was calibrated after it was zeroed: {name} is {now}, but was {before}"
     return ""
 
 
@@ -205,7 +205,7 @@ def drives_of(
 def looks_at_rest(
     drives: Mapping[str, Drive], robot: RobotConfig
 ) -> tuple[dict[str, DriveLook], set[str]]:
-    """Observe drives until their joints rest, at most for `REST_WAIT_S`.
+    """Observe drives until their joints rest, for at most `REST_WAIT_S`.
 
     Returns the observations, and the modules that still move. A swinging leg is slow where it
     reverses, so its encoders must read the same after `ROUND_S`.
@@ -330,7 +330,7 @@ def store_rests(
 ) -> int:
     """Wait until modules rest, and store their rest positions; return how many were stored.
 
-    The stored position of a module that does not rest, or that has another zero, is erased.
+    The stored position of a module that is not idle and at rest, or has another zero, is erased.
 
     Raises:
         DriveError: no zero is stored, or the file cannot be written.
@@ -367,7 +367,7 @@ def rests_after_down(config: Path, run_dir: Path, services: Iterable[str]) -> st
         if is_simulated(robot) or not modules or not path.is_file():
             return ""
         kept = store_rests(robot, config, run_dir, modules, lines.append)
-        lines.append(f"{kept} of {len(modules)} modules rest; their positions are in {path}")
+        lines.append(f"{kept} of {len(modules)} modules rest; their positions are stored in {path}")
     except XrlError as error:
         lines.append(f"the joints' rest positions are not stored: {error}")
     return "\n".join(lines)

@@ -1,6 +1,6 @@
 """`python -m tools.dev.words`: finds phrases that a colleague would not say, with replacements.
 
-It searches README, docs, and the Python files of services, shared and tools.
+It searches README, CONTRIBUTING, docs, and the Python files of services, shared and tools.
 """
 
 from __future__ import annotations

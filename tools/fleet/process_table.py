@@ -314,7 +314,7 @@ def _listeners(
 
 
 def _check_lengths(run_dir: Path, listeners: Iterable[ListenPoint]) -> None:
-    """Refuse a run directory that is too long for the paths of its UNIX sockets."""
+    """Refuse a run directory whose path is too long for its UNIX sockets."""
     paths = [at.endpoint.removeprefix(UNIX) for at in listeners if at.endpoint.startswith(UNIX)]
     # supervisord first binds NAME.PID, then renames it
     paths.append(f"{live_dir(run_dir) / SUPERVISOR_SOCKET}.4194304")

@@ -42,7 +42,7 @@ def service_pids(run_dir: Path) -> dict[str, int]:
 
 
 def belongs(pid: int, run_dir: Path) -> bool:
-    """Return True if a process is of this user and of the fleet in this run directory."""
+    """Return True if a process belongs to this user and to the fleet in this run directory."""
     try:
         own = Path(f"/proc/{pid}").stat().st_uid == os.getuid()
     except OSError:
@@ -59,7 +59,7 @@ def _environment(pid: int) -> list[bytes]:
 
 
 def fleets() -> set[str]:
-    """Return the run directories of all fleets that have a process."""
+    """Return the run directories of this user's fleets that have a process."""
     mark = os.fsencode(f"{FLEET_VARIABLE}=")
     found = set()
     for entry in Path("/proc").iterdir():
@@ -129,7 +129,7 @@ def wait_until_gone(run_dir: Path, timeout_s: float) -> set[int]:
     left: set[int] = set()
     while True:
         # An ending process loses its environment before its sockets, so once found it is
-        # followed by its id.
+        # tracked by its id.
         left = {pid for pid in left | fleet_pids(run_dir) if not is_gone(pid)}
         if not left or time.monotonic() > deadline:
             return left

@@ -56,7 +56,7 @@ class ProxyClient:
             raise FleetError(self._why_absent()) from None
         except OSError as error:
             kill = "`xrl kill network_proxy`"
-            out = f"{kill[:-1]} --signal CONT` if it was stopped, or {kill}"
+            out = f"run {kill[:-1]} --signal CONT` if it was stopped, else {kill}"
             text = f"{self._path}: the network proxy does not answer: {error}; {out}"
             raise FleetError(text) from None
         if not line:

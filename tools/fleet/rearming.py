@@ -92,11 +92,11 @@ def hindrance(
             f"{pull_n:.0f} N on the harness would move the robot at once; reduce it below "
             f"{PULL_MAX_N:g} N (take hands and load off; move a simulated hand with `xrl lead`)"
         )
-    return "" if planner else "no planner is running, but taking over a drive needs one"
+    return "" if planner else "taking over a drive needs a planner; run `xrl start planner`"
 
 
 class _Ear:
-    """Newest state of each module, and whether a planner sends its status."""
+    """Newest state of each module, newest force, and whether a planner sends its status."""
 
     def __init__(self, session: Session) -> None:
         self._latest = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in MODULES}

@@ -203,7 +203,7 @@ def _state_cell(state: str) -> str | Text:
 
 
 def warn_of_others(console: Console, own: Path | None = None) -> None:
-    """Print a line for each other fleet on this machine."""
+    """Print a line for each other fleet of this user on this machine."""
     for other in sorted(procfs.fleets()):
         if own is None or Path(other) != own:
             console.print(

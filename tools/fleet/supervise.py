@@ -228,8 +228,8 @@ class SupervisedFleet:
         """Stop every service and the supervisor, and remove their files.
 
         Each service, even a suspended one, first gets its stop signal, then SIGKILL after its
-        timeout. Without a fleet this does nothing. Only foreign files and requested logs remain
-        in the run directory; with `keep_stops` an emergency stop remains too.
+        timeout. Without a fleet this does nothing. Only foreign files, temperatures and requested
+        logs remain in the run directory; with `keep_stops` an emergency stop remains too.
         """
         self._end()
         if not self.run.is_marked:
@@ -271,7 +271,7 @@ class SupervisedFleet:
         return self._process is not None and self._process.poll() is None
 
     def _end_unsupervised(self, *, take_over: bool) -> None:
-        """End the services that a dead supervisor left here, provided that their drives hold."""
+        """End services that a dead supervisor left here; their drives keep holding."""
         left = procfs.fleet_pids(self.run.path)
         if not left:
             return

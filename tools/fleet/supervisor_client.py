@@ -56,7 +56,7 @@ class Supervisor:
         self._run = run
 
     def info(self, services: Iterable[str]) -> list[ServiceInfo]:
-        """Return these services, in this order."""
+        """Return the state of these services, in this order."""
         rows = {row["name"]: row for row in self.call("xrl.services")}
         return [_service_info(rows[name]) for name in services]
 

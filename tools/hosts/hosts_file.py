@@ -28,7 +28,7 @@ class Host(Section, frozen=True):
     allowed to start systemd units."""
     services: tuple[str, ...]
     tools: tuple[str, ...] = (VIEWER,)
-    """Principals whose keys the tools on this host have."""
+    """Principals whose keys the tools on this host use."""
     processors: str = ""
     """Processors for the services, in systemd's notation, such as `2-3`; empty for all."""
     record: bool = True

@@ -258,10 +258,12 @@ def _about_keys(probe: Probe, wanted: dict[str, bytes]) -> list[str]:
     other = sorted(n for n, found in wanted_now.items() if probe.keys.get(n) != found)
     extra = sorted(set(probe.keys) - set(wanted))
     if NAMES in other:
-        wrong.append("accepts other key generations than the authority; run `xrl hosts update`")
+        wrong.append("accepts key generations that are not the authority's; run `xrl hosts update`")
         other.remove(NAMES)
     if other:
-        wrong.append(f"other keys than the authority's: {', '.join(other)}; run `xrl hosts update`")
+        wrong.append(
+            f"keys differ from the authority's: {', '.join(other)}; run `xrl hosts update`"
+        )
     if wanted and extra:
         wrong.append(f"keys that it must not have: {', '.join(extra)}; run `xrl hosts update`")
     return wrong
@@ -285,5 +287,5 @@ def disagreements(rows: list[HostRow]) -> list[str]:
 _SAME_ON_ALL: Final[dict[str, Callable[[HostRow], str]]] = {
     "versions": lambda row: row.revision,
     "lock files": lambda row: row.made_from[0],
-    "Pythons": lambda row: row.made_from[1],
+    "Python versions": lambda row: row.made_from[1],
 }

@@ -47,7 +47,7 @@ class Probe(msgspec.Struct, frozen=True):
     keys: dict[str, str]
     """Hashes of the key files, by name."""
     wrong: tuple[str, ...]
-    """Faults of robot file or keys that prevent a start of the services."""
+    """Faults of robot file or keys that keep the services from starting."""
     warnings: tuple[str, ...]
 
 
@@ -113,7 +113,7 @@ def _is_older(path: Path, other: Path) -> bool:
 
 
 def _environment_is_current() -> bool:
-    """Return True if this environment was made from the checkout's lock file (deploy/lib.sh)."""
+    """Return True if this environment was made from a lock file of the checkout (deploy/lib.sh)."""
     try:
         made_from = Path(sys.prefix, "xrl.stamp").read_text(encoding="utf-8").split()
         rest = (CHECKOUT / "pyproject.toml").read_bytes()

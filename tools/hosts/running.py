@@ -83,7 +83,7 @@ def lower(
     """Lower the robot from one host until its legs bear no weight; do nothing if no host is up.
 
     Raises:
-        FleetError: the legs bear weight, or it is unknown whether they do.
+        FleetError: the legs still carry the robot, or it is unknown whether they do.
     """
     try:
         up = [remote for remote in remotes if is_up(remote)]
@@ -112,7 +112,9 @@ def status(hosts: Hosts, remote: Remote) -> FleetStatus:
     try:
         return msgspec.json.decode(said.encode(), type=FleetStatus)
     except msgspec.DecodeError as error:
-        raise FleetError(f"{remote.host.name}: invalid status: {error}") from None
+        raise FleetError(
+            f"{remote.host.name}: invalid status: {error}; use the same checkout on every host"
+        ) from None
 
 
 def joined(found: dict[str, FleetStatus]) -> FleetStatus:

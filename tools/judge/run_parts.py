@@ -12,7 +12,7 @@ from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, parts_of, read_part
 
 _LOOK_S: Final = 20.0
-"""Length of the parts in which the scenario's start is searched, s."""
+"""Length of the parts in which the scenario's start is searched for, s."""
 
 
 class PartFlags(Flags):
@@ -54,7 +54,7 @@ def read_asked(flags: PartFlags, index: RunIndex, *, as_sent: bool = False) -> R
 
 
 def zero_ns(index: RunIndex) -> int:
-    """Return time zero of a run, monotonic: the scenario's start, or the log's first message."""
+    """Return time zero of a run, monotonic: that of `verdict.course`, else the first message."""
     for part in parts_of(index, part_s=_LOOK_S, margin_s=0.0):
         try:
             return verdict.course(part).zero_ns

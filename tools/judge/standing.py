@@ -48,7 +48,7 @@ LIMITS: Final = (
     VerdictLimit("handover_torque_step_nm", 5.0, "N m", "torque step at hand-over"),
     VerdictLimit("reengage_s", 1.5, "s", "restart to TRACK, slowest module"),
     VerdictLimit("pd_cycles_late_pct", 0.5, "%", "PD cycles later than two periods"),
-    VerdictLimit("fleet_cpu_pct", 160.0, "%", "CPU of all processes, of 200"),
+    VerdictLimit("fleet_cpu_pct", 160.0, "%", "CPU of all processes (100 %: one core)"),
     VerdictLimit("sequence_gaps", 0.0, "", "messages lost on the way to the log"),
 )
 """Live targets. Only `Summary.sound` decides the exit code: the robot stands at the end of the run,
@@ -83,7 +83,7 @@ def why_not_standing(row: SimTruth, robot: RobotConfig) -> str:
         return f"its COM is beyond the soles, at {1e3 * x:.0f}, {1e3 * y:.0f} mm"
     tilt = max(row.foot_right_tilt, row.foot_left_tilt)
     if tilt > SOLE_TILT_MAX:
-        return f"a sole has lifted, by {tilt:.2f} rad"
+        return f"a sole is tilted by {tilt:.2f} rad"
     roll, pitch, yaw = row.angles
     if max(abs(roll), abs(yaw)) > TURNED_MAX or not PITCH[0] <= pitch <= PITCH[1]:
         return f"its torso has turned: roll {roll:.2f}, pitch {pitch:.2f}, yaw {yaw:.2f} rad"

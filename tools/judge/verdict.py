@@ -466,7 +466,7 @@ def _holds(log: RunLog, module: str, from_ns: int) -> list[JointEvent]:
 def _add_handover(summary: Summary, log: RunLog, kills: Sequence[RunEvent]) -> None:
     """Add the time from the first kill to HOLD, and the largest torque step into HOLD.
 
-    Steps count from the first kill, or from the first impairment of the network.
+    Steps count from the first kill or the first impairment of the network, whichever is earlier.
     """
     impaired = [row.t_ns for row in log.messages(topics.LINK_EVENT)]
     begins = [row.t_ns for row in kills[:1]] + impaired[:1]

@@ -128,7 +128,7 @@ def network(summary: Summary) -> list[str]:
 
 
 def digits(value: float) -> str:
-    """Return a figure with three digits, or all before the point: 1540, not 1.54e+03.
+    """Return a figure with three significant digits, or all before the point: 1540, not 1.54e+03.
 
     A nonzero value below `NOTHING` is 0.00; zero is 0.
     """

@@ -138,7 +138,7 @@ class _Felt(NamedTuple):
 
 
 class _MeasuredThresholds(NamedTuple):
-    """Thresholds that park needs of a person, and how they were found."""
+    """A person's thresholds for park, and how they were found."""
 
     thresholds: WearerThresholds
     squats: int
@@ -148,11 +148,11 @@ class _MeasuredThresholds(NamedTuple):
 
 
 def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
-    """Return a person's thresholds of park, within the ranges of the robot file.
+    """Return a person's thresholds for park, within the ranges of the robot file.
 
     Args:
-        log: a person stood, squatted at least twice, and rested in a crouch, led by the planner.
-        robot: the robot of the log; its own threshold remains if the log contains no evidence.
+        log: a person stood, squatted at least twice, and rested in a crouch, while leading.
+        robot: the robot of the log; its `open_back_nm` remains if the torso was never pitched.
 
     Raises:
         RunError: the log does not contain that motion.
@@ -181,7 +181,7 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
     if rests_n * IDLE_MARGIN > leads_n:
         doubts.append(
             f"this person pulls with up to {rests_n:.0f} N at rest, but leads up with "
-            f"{leads_n:.0f} N: a parked robot would open on its own below {open_n:.0f} N"
+            f"{leads_n:.0f} N: with open_n below {open_n:.0f} N, the robot would unpark on its own"
         )
     why = [f"open_n: led up with {leads_n:.1f} N, at rest at most {rests_n:.1f} N"]
     open_back_nm = park.open_back_nm
@@ -203,7 +203,7 @@ def thresholds_of(log: RunLog, robot: RobotConfig) -> _MeasuredThresholds:
 
 
 def _eroded(inside: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Return the samples that are inside, and at least `by` samples away from any that is not."""
+    """Return True for samples that, with `by` neighbours on each side, are all inside."""
     padded = np.pad(inside, by, constant_values=True)
     return np.asarray(sliding_window_view(padded, 2 * by + 1).all(axis=1))
 
@@ -216,7 +216,7 @@ def _in_range(key: str, value: float) -> float:
 
 
 def _lasting(values: Array, inside: NDArray[np.bool_], t: Array) -> float:
-    """Return the largest value that lasts as long as an input that opens park; at least 0."""
+    """Return the largest value that lasts as long as an input that unparks; at least 0."""
     width = max(1, round(LASTS_NS / NS_PER_S / float(np.median(np.diff(t)))))
     kept = np.where(inside, values, 0.0)
     if len(kept) < width:

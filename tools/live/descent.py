@@ -5,7 +5,7 @@ tips over as from a stand, and the torso hits the floor at 2.8 to 3.1 m/s either
 holds at the end of the descent, and its drives idle only after a hoist or a stand carries it.
 
 `Descent` makes the decisions, without bus or clock. The joints' torques show whether the robot
-carries weight; an unknown load counts as weight.
+stands on its legs; an unknown load counts as weight.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ WAYS: Final = (
     "`xrl down --limp` to let it drop"
 )
 LIGHT_FRACTION: Final = 0.25
-"""With less than this fraction of the torso's weight on its legs, the robot hangs. Without its
-payload, half of the weight is left."""
+"""With less than this fraction of the torso's weight on its legs, the robot hangs. Without the
+payload, the torso keeps half of its weight."""
 LIGHT_S: Final = 1.0
-"""Time for which the legs must be that light, s: a bouncing robot is light for a moment."""
+"""Time for which the load must stay that low, s: a bouncing robot is light for a moment."""
 HEARD_S: Final = 3.0
 """Timeout for the first states of all six modules, s."""
 PATIENCE_S: Final = 8.0
@@ -92,7 +92,7 @@ class Ask(Enum):
 class DescentPhase(Enum):
     """Progress of the descent."""
 
-    LOOKING = "checking whether the robot bears weight"
+    LOOKING = "checking whether the legs carry the robot"
     LOWERING = "going down, led by the planner"
     SETTLING = "sinking in DAMP"
     RESTING = "holding at its lowest pose"
@@ -220,7 +220,7 @@ class Descent:
         ]
         if limp:
             raise FleetError(
-                f"{', '.join(limp)}: the other modules may carry weight, and going down would "
+                f"{', '.join(limp)}: the legs may still carry the robot, and going down would "
                 f"tip the robot; {WAYS}"
             )
         damped = all(state is not None and state.mode == Mode.DAMP for state in states)
@@ -264,7 +264,7 @@ class Descent:
             self._moved_s = now_s
             if self._for_s(now_s) > HEARD_S:
                 raise FleetError(
-                    f"not all modules go to DAMP; run `xrl status` to see which; {WAYS}"
+                    f"not all modules go to DAMP; `xrl status` shows their modes; {WAYS}"
                 )
             return Ask.STOP
         if len(known) < len(MODULES) or abs(self._knee - self._rested) > REST_RAD:
@@ -278,7 +278,7 @@ class Descent:
     def _rest(self, now_s: float) -> Ask:
         if self._for_s(now_s) > self._wait_s:
             raise FleetError(
-                f"down, but the robot may still bear weight: {self._bears}; its services "
+                f"down, but the legs may still carry the robot: {self._bears}; its services "
                 f"continue, and the drives stay armed; {WAYS}"
             )
         return Ask.NOTHING
@@ -316,13 +316,15 @@ def lower(robot: RobotConfig, run_dir: Path, tell: Tell, *, wait_s: float, simul
     weight must be taken within `wait_s`; a simulated robot only needs to be down.
 
     Raises:
-        FleetError: the robot bears weight and cannot be lowered, or nothing takes its weight.
+        FleetError: the robot stands and cannot be lowered, or nothing takes its weight.
     """
     try:
         with open_session(robot, "down", run_dir) as session:
             _Lowering(robot, session, tell, simulated=simulated).run(Descent(robot, wait_s))
     except BusError as error:
-        raise FleetError(f"{error}; it is unknown whether the robot bears weight; {WAYS}") from None
+        raise FleetError(
+            f"{error}; it is unknown whether the legs carry the robot; {WAYS}"
+        ) from None
 
 
 class _Lowering:

@@ -61,7 +61,7 @@ _FILE: Final = "--inject"
 
 
 def parse_inject(text: str) -> Inject:
-    """Parse `LINK key=value ...` for argparse; without `at` it begins with the scenario."""
+    """Parse `LINK key=value ...` for argparse; `at` is 0 s unless given."""
     link, *words = text.replace(",", " ").split() or [""]
     try:
         return _made(link, _split(words))

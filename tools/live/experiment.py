@@ -66,7 +66,7 @@ class PlantFlags(Flags):
         tuple[str, ...],
         Arg(
             metavar="NAME|FILE|KEY=VALUE",
-            help="differences of the simulated robot from its robot file: "
+            help="how the simulated robot differs from its robot file: "
             f"{', '.join(NAMED)} (default: realistic), a TOML file, or one value, such as "
             "floor.slope=[0.03,0.0]; repeatable: a name or file replaces earlier words "
             "(deploy/plants/README.md)",
@@ -145,7 +145,7 @@ class LawFlags(ConfigFlags, ImuFlags):
     split: Annotated[str | None, Arg(choices=choices("split"))] = None
     """local gains: the certified schedule, or the paper's diag(K_q) (default: law.split)"""
     jacobian: Annotated[str | None, Arg(choices=choices("jacobian"))] = None
-    """load sharing of the legs (default: law.jacobian); average has no certified gains, so it
+    """load sharing between the legs (default: law.jacobian); average has no certified gains, so it
     implies --split diagonal"""
 
 
@@ -296,7 +296,7 @@ def record_of_start(out: Path) -> Iterator[None]:
 def write_inputs(
     out: Path, robot: RobotConfig, scenario: Scenario, true_plant: PlantConfig
 ) -> tuple[Path, ...]:
-    """Write robot, scenario, plant and, if present, gain schedule beside a run's results."""
+    """Write robot, scenario, plant and any gain schedule beside the results; return the paths."""
     robot_path, scenario_path, plant_path = (
         out / name for name in ("robot.toml", "scenario.toml", PLANT_FILE)
     )

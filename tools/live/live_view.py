@@ -60,7 +60,7 @@ class LiveView:
         self._next_s = now + self._period_s
         status = self._hear(now)
         words = [snapshot.note, active(self._injects, snapshot.truth.scenario_s)]
-        if snapshot.truth.hoist == 0.0:  # while the robot hangs the planner only reports that
+        if snapshot.truth.hoist == 0.0:  # while the robot hangs, the planner only reports that
             words += said_by(status)
         note = "; ".join(word for word in words if word)
         self._print(Text(_line(snapshot.truth, snapshot.modes, note)))

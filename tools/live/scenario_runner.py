@@ -1,7 +1,7 @@
 """Leads a live run through its scenario: start, kills, restarts, end.
 
-It receives the simulated truth from the bus and acts by scenario time. Each action is published as
-a run event, so the log shows all of them.
+It receives the simulated truth from the bus and acts by scenario time. It publishes each action as
+a run event for the log, except impairments, which the network proxy publishes.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ STARTING: Final = "waiting for six modules to track"
 FULL_CORE: Final = 0.2
 """Idle fraction below which one of two cores may be full."""
 ENDING_S: Final = 3.0
-"""Timeout for a service to end after TERM or INT, s; by then it has ended or was killed."""
+"""Timeout for a service to end after TERM or INT, s."""
 
 
 class LiveSnapshot(NamedTuple):
@@ -135,7 +135,7 @@ class _ArmedKill:
 
 
 class _RunEvents:
-    """Publishes the actions on the run, so that the log shows them."""
+    """Publishes the actions on the run, and stalls, so that the log shows them."""
 
     def __init__(self, session: Session) -> None:
         self._publisher = session.publisher(topics.RUN_EVENT, RunEvent)
@@ -214,7 +214,7 @@ class ScenarioRunner:
 
     @property
     def said(self) -> list[RunEvent]:
-        """The actions on the run until now."""
+        """The actions and stalls until now."""
         return self._events.said
 
     def _run(self, is_over: Callable[[], bool]) -> EndOfRun:
@@ -259,7 +259,7 @@ class ScenarioRunner:
         time.sleep(LAST_WORDS_S)
 
     def _sample_processes(self, meter: _CpuMeter) -> None:
-        """Read the process ids once a second, so that a kill needs no call to the supervisor."""
+        """Read the process ids once a second, so that a kill needs no search in /proc."""
         now_s = time.monotonic()
         if now_s >= self._next_pids_s:
             self._next_pids_s = now_s + PIDS_EVERY_S

@@ -24,9 +24,10 @@ class HandRow(msgspec.Struct, frozen=True):
 
 
 def hand_path(log: RunLog) -> tuple[HandRow, ...]:
-    """Return the motion of the hand during the scenario, in order; empty if nobody led it.
+    """Return the motion of the hand during the scenario, in order.
 
-    The first row is the hand's last position before the scenario.
+    If the hand led before the scenario, the first row is its last position then. The result is
+    empty if nobody moved the hand, or the scenario never started.
     """
     led: list[HandLead] = log.messages(topics.OPERATOR_HAND)
     truths: list[SimTruth] = log.messages(topics.SIM_TRUTH) if led else []

@@ -1,6 +1,6 @@
 """Index of a run's files: metadata, attachments, and the places of the messages.
 
-A record of one hour has 2 GiB, and would take ten times that in memory. So its files are skimmed
+A record of one hour takes 2 GiB, and ten times that in memory. So its files are skimmed
 once, and `tools/logs/run_log.py` reads only the needed parts. A split run consists of several files
 in one directory.
 """
@@ -148,7 +148,7 @@ class _RecordedFile:
             raise RunError(f"{self.path}: clock.offset_ns is {text[:40]!r}; must be an integer")
         offset_ns = int(text)
         if max(abs(t - offset_ns) for t in self.span_ns or (offset_ns,)) > _CLOCK_MAX_NS:
-            raise RunError(f"{self.path}: its times and clock.offset_ns contradict each other")
+            raise RunError(f"{self.path}: its times contradict clock.offset_ns; it is damaged")
         return offset_ns
 
     @property

@@ -309,7 +309,7 @@ def read_part(index: RunIndex, part: RunPart, *, as_sent: bool = False) -> RunLo
     """Read a part of a run at once."""
     length_s = index.length_s
     if part.begin_s > length_s:
-        raise RunError(f"{index.path}: --from {part.begin_s:g}: the run is {length_s:.1f} s long")
+        raise RunError(f"{index.path}: --from {part.begin_s:g}: must be at most {length_s:.1f}")
     read_s = min(part.end_s, length_s) - max(part.begin_s, 0.0)
     if read_s > WHOLE_MAX_S:
         raise RunError(

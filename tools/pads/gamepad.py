@@ -76,7 +76,7 @@ class Gamepad:
 
     @property
     def deflection(self) -> Deflection:
-        """Left stick: height; right stick: pitch (forward is forward); triggers: assist.
+        """Left stick: height; right stick: pitch (push forward to lean forward); triggers: assist.
 
         A lost pad has zero deflection.
         """
@@ -119,7 +119,7 @@ class Gamepad:
         return ""
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for an event, at most a timeout, s; process all events that have arrived."""
+        """Wait for an event, for at most `timeout_s`; process all events that have arrived."""
         event = ctypes.byref(self._event)
         came = sdl2.SDL_WaitEventTimeout(event, round(1000 * timeout_s))
         while came:

@@ -14,7 +14,7 @@ PITCH_RATE: Final = 0.4
 ASSIST_RATE: Final = 40.0
 """N/s at full deflection."""
 DEAD_ZONE: Final = 0.2
-"""Deflection up to which it counts as zero: a worn stick rests up to 15 % off its old position."""
+"""Deflections up to this count as zero: a worn stick rests up to 15 % off its old position."""
 
 
 class Deflection(NamedTuple):

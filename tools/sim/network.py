@@ -30,7 +30,7 @@ OVERHEAD_BYTES: Final = 40
 class VirtualLink(Generic[M]):
     """One direction between two processes; the receiver stores only the newest arrival.
 
-    A message that arrives after one that was sent later is dropped, as Zenoh does by its own
+    A message that arrives after one that was sent later is dropped, as Zenoh does with its own
     sequence numbers.
     """
 

@@ -34,7 +34,7 @@ Outcome = TypeVar("Outcome")
 AFTER_FALL_S: Final = 1.0
 """Time for which a recorded run continues after a fall, s, so that the log shows it."""
 DRAIN_EVERY: Final = 512
-"""Number of waiting messages from which all of them are written to the log."""
+"""Number of waiting messages at which all of them are written to the log."""
 
 
 class RecordedMessages:

@@ -2,7 +2,7 @@
 
 `xrl bench bus` and `xrl bench fleet` measure the bus and the whole fleet. Absolute times on a busy
 machine mean little. To compare two versions, use `--against`, which runs both in turn, or compare
-each figure's ratio to the yardstick of the same table.
+each figure's ratio to the yardstick in the same table.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def run(flags: AgainstFlags) -> int:
         )
     note = (
         "Each figure is the calling thread's CPU time: the median of the rounds' medians. Cold: "
-        f"before each call, {SWEPT_BYTES >> 20} MiB are swept and the thread sleeps for "
+        f"before each call, {SWEPT_BYTES >> 20} MiB are written and the thread sleeps for "
         f"{1e3 * ASLEEP_S:g} ms. Yardstick: {YARDSTICK_CALLS} solutions of a 12 x 12 system in "
         "NumPy."
     )

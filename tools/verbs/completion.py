@@ -18,7 +18,7 @@ xrl completion zsh > "${fpath[1]}/_xrl"
 
 
 class CompletionFlags(Flags):
-    """Shell to complete words in."""
+    """Shell to print the script for."""
 
     shell: Annotated[str, positional("SHELL", choices=tuple(shtab.SUPPORTED_SHELLS))]
     """shell that the script is for"""

@@ -37,7 +37,7 @@ class Cue(Enum):
     FOLLOWS = "follows"
     """The planner leads, and all six modules track: the robot follows the hand."""
     HOLDS = "holds"
-    """The robot stands still, whatever the hand does. The wearer should stop leading."""
+    """The robot stands and does not follow the hand. The wearer should stop leading."""
     SINKS = "sinks"
     """A module is in DAMP, DISARMED or FAULT: the robot sinks."""
     FALLEN = "fallen"

@@ -196,5 +196,5 @@ class _Usb:
             found,
             "connected",
             fix,
-            f"{why}: CAN of firmware 0.5 does not report them",
+            f"{why}: firmware 0.5 does not report them over CAN",
         )

@@ -22,7 +22,7 @@ xrl down --limp --keep-stops  # from a systemd unit
 
 
 class DownFlags(RunDirFlags):
-    """Fleet to stop, and how to treat a robot that bears weight."""
+    """Fleet to stop, and how to treat a robot that stands on its legs."""
 
     limp: Annotated[bool, Arg(exclusive="weight")] = False
     """idle the drives at once, under any load: a standing robot falls"""
@@ -72,8 +72,8 @@ def _lower(fleet: SupervisedFleet, flags: DownFlags) -> None:
     manifest = fleet.run.read_manifest()
     if manifest is None:
         raise FleetError(
-            f"{fleet.run.path}: the fleet's files are missing, so it is unknown whether the robot "
-            f"bears weight; {WAYS}"
+            f"{fleet.run.path}: the fleet's files are missing, so it is unknown whether the legs "
+            f"carry the robot; {WAYS}"
         )
     robot = manifest.robot()
     lower(robot, fleet.run.path, partial(print, flush=True), wait_s=flags.wait, simulated=simulated)

@@ -47,7 +47,7 @@ class EstopFlags(Flags):
     """Robot to stop, and the way to reach it."""
 
     run_dir: Annotated[Path, parsed(Path, "DIR")] = dataclasses.field(
-        default_factory=default_run_dir  # of any user: anyone who can reach the robot may stop it
+        default_factory=default_run_dir  # may be another user's: all who reach a robot may stop it
     )
     """the fleet's run directory, with its logs (default: $XRL_RUN_DIR, else /tmp/xrl-UID)"""
     local: bool = False
@@ -103,7 +103,7 @@ def estop(flags: EstopFlags) -> int:
 
 
 def _is_here(flags: EstopFlags) -> bool:
-    """Return True if the fleet of the run directory uses the --config file, or none is given."""
+    """Return True if the run directory's fleet uses the --config file, or without --config."""
     if flags.config is None:
         return True
     manifest = RunDir(flags.run_dir).read_manifest()
@@ -156,8 +156,8 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
 def _conclude(going: list[str], which: str) -> None:
     refuse_going(going)
     Console().print(
-        f"stopped (DAMP): {which}. The robot sinks slowly; modules beside a limp or dead "
-        "module hold. To end the stop, run `xrl rearm` or `xrl down`"
+        f"stopped (DAMP): {which}. The robot sinks slowly, or holds if a module on its host is "
+        "limp or dead. To end the stop, run `xrl rearm` or `xrl down`"
     )
 
 

@@ -32,7 +32,7 @@ class _FaultSection(NamedTuple):
     about: str
     headings: tuple[str, ...]
     rows: list[tuple[str, ...]]
-    """Cells, beginning with the name."""
+    """Cells of each row, beginning with the name."""
 
 
 class FaultsFlags(ConfigFlags):
@@ -77,8 +77,9 @@ def sections(limits: TripsConfig) -> Iterator[_FaultSection]:
         "Drive faults",
         """\
 Unless the row says "no FAULT", the module goes to FAULT, and the planner holds the other five. An
-axis that disarms floats; the service then idles its sibling at once. Nothing is re-armed
-automatically: a person removes the cause, then restarts the module's service (`xrl kill MODULE`).
+axis that disarms floats; the service then idles the module's other axis at once. Nothing is
+re-armed automatically: a person removes the cause, then restarts the module's service
+(`xrl kill MODULE`).
 To reproduce a fault: `xrl sim --fault knee_left:encoder@4`.""",
         ("fault", "meaning", "drive", "limp", "zero lost", "cause", "what to do"),
         [
@@ -102,7 +103,8 @@ To reproduce a fault: `xrl sim --fault knee_left:encoder@4`.""",
         "Trips",
         """\
 On a trip all six modules go to HOLD. The planner leads again after a wait that grows with each
-trip. After a trip of its own, every value must also have been within its limit for a second.""",
+trip. After a trip that the planner detected, all its values must first stay within their limits for
+a second.""",
         ("trip", "detected by", "condition", "limit", "what to do"),
         [
             (name, by, row.measured, _limit(row, getattr(limits, row.key)), row.recovery)

@@ -84,7 +84,7 @@ def run(flags: _GainsFlags) -> int:
 
 
 def compute(robot: RobotConfig, console: Console, damping_of: Path | None = None) -> GainSchedule:
-    """Solve the schedule; search for damping and coupling, or take them from another schedule."""
+    """Compute the schedule; search for damping and coupling, or take them from another."""
     design = None
     if damping_of is not None:
         other = gain_schedule.read(damping_of)
@@ -123,8 +123,9 @@ def _show(robot: RobotConfig, schedule: GainSchedule, console: Console) -> None:
     _show_damping(robot, schedule, console)
     margins = split_program.smallest_margins(robot, schedule)
     console.print(
-        f"smallest margin at the nodes and halfway between them: {margins.service:.2f} of the "
-        f"required one with the joint services alone, {margins.onboard:.2f} with the drives alone"
+        "smallest margin at the nodes and halfway between them (1 is the required "
+        f"stiffness): {margins.service:.2f} with the joint services alone, "
+        f"{margins.onboard:.2f} with the drives alone"
     )
 
 
@@ -152,7 +153,7 @@ def _show_damping(robot: RobotConfig, schedule: GainSchedule, console: Console) 
 
 
 def _show_stiffness(robot: RobotConfig) -> int:
-    """Print the design of the body for x and y."""
+    """Print the body's stiffness design along x and y, and compare law.K_p with it."""
     design = for_robot(robot)
     table = Table(title="Body stiffness, legs straight (paper section IV)", title_justify="left")
     table.add_column("")

@@ -73,7 +73,7 @@ class HostsUpFlags(HostsFlags):
 
 
 class HostsDownFlags(HostsFlags):
-    """Handling of a robot that bears weight."""
+    """Handling of a robot that stands on its legs."""
 
     limp: bool = False
     """idle the drives at once, under any load: a standing robot falls"""
@@ -93,7 +93,7 @@ class _Given(NamedTuple):
     remotes: list[Remote]
 
     def files(self) -> dict[str, list[HostFile]]:
-        """Return each host's files by its name; without an authority, the keys are missing."""
+        """Return the files by host name; without an authority, the keys are missing."""
         config = self.flags.config
         gain_schedule.require(self.robot, config)
         try:
@@ -155,7 +155,7 @@ def update(flags: UpdateFlags) -> int:
 
 
 def up(flags: HostsUpFlags) -> int:
-    """Start and check all hosts, and only then arm: a stop on one host applies to all."""
+    """Start and check the hosts, and only then arm: a stop on one host applies to all."""
     given = _given(flags)
     failed_to_start = _each(given, running.start)
     if failed_to_start or flags.disarmed:
@@ -176,7 +176,7 @@ def up(flags: HostsUpFlags) -> int:
 
 
 def estop(flags: HostsFlags) -> int:
-    """Stop every module, on all hosts."""
+    """Stop every module on the selected hosts."""
     given = _given(flags)
     failed = _each(given, lambda remote: running.estop(given.hosts, remote))
     if failed:
@@ -185,7 +185,7 @@ def estop(flags: HostsFlags) -> int:
 
 
 def down(flags: HostsDownFlags) -> int:
-    """Lower the robot, whose legs may be on several hosts, then stop all services."""
+    """Lower the robot from one of all hosts, then stop the selected hosts' services."""
     given = _given(flags)
     if not flags.limp:
         everyone = [Remote(given.hosts, host) for host in given.hosts.host]
@@ -194,7 +194,7 @@ def down(flags: HostsDownFlags) -> int:
 
 
 def status(flags: HostsFlags) -> int:
-    """Show the services of all hosts in one table."""
+    """Show the services of the selected hosts in one table."""
     given = _given(flags)
     found = on_all(given.remotes, lambda remote: running.status(given.hosts, remote))
     good = {name: one for name, one in found.items() if not isinstance(one, FleetError)}
@@ -207,7 +207,7 @@ def status(flags: HostsFlags) -> int:
 
 
 def check(flags: HostsFlags) -> int:
-    """Check all hosts; return the exit code of a fault if one has a fault or hosts disagree."""
+    """Check the hosts; return the exit code of a fault if one has a fault or they disagree."""
     given = _given(flags)
     files = given.files()
     found = on_all(
@@ -227,7 +227,7 @@ def check(flags: HostsFlags) -> int:
 
 
 def _each(given: _Given, work: Callable[[Remote], str]) -> int:
-    """Run a function for all hosts and print each result at once; return 0 if all succeeded."""
+    """Run a function for the hosts; print each result as it arrives; return 0 if all succeeded."""
     found = on_all(given.remotes, work, _tell)
     failed = any(isinstance(result, FleetError) for result in found.values())
     return FAULT_EXIT_CODE if failed else 0

@@ -68,11 +68,11 @@ class InjectFlags(RunDirFlags):
     list: Annotated[bool, Arg(one_of="what")] = False
     """list active and planned impairments"""
     clear: Annotated[str | None, parsed(_link, "LINK", one_of="what")] = None
-    """end every impairment that affects this link, on all links that it affects"""
+    """end every impairment that affects this link, also on the impairment's other links"""
 
 
 def run(flags: InjectFlags) -> int:
-    """Start or end an impairment, and show those that are active."""
+    """Start or end an impairment, and show active and planned ones."""
     console = Console()
     client = ProxyClient(flags.run_dir)
     if flags.words is not None:

@@ -152,7 +152,7 @@ def _authority_folder(flags: KeysFlags, robot: RobotConfig) -> Path:
 def _opened(flags: KeysFlags, robot: RobotConfig) -> Authority:
     authority = Authority(_authority_folder(flags, robot))
     if authority.names.robot != robot.name:
-        right = f"give that of {robot.name!r} with --authority"
+        right = f"give the authority of {robot.name!r} with --authority"
         raise BusError(
             f"{authority.folder}: is the authority of {authority.names.robot!r}; {right}"
         )

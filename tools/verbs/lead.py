@@ -1,4 +1,4 @@
-"""`xrl lead`: leads height, pitch and assist with a gamepad or the keyboard."""
+"""`xrl lead`: requests assist, and leads a simulated robot, with a gamepad or the keyboard."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from tools.pads.pilot import Deflection, Led, Pilot
 from tools.terminal import Console
 
 PERIOD_S: Final = 0.05
-"""Period of each request, s: an intent fades out unless it is repeated."""
+"""Period of the requests, s: an intent fades out unless it is repeated."""
 LINKS_S: Final = 3.0
 SETTLE_S: Final = 60.0
 """Timeout for releasing the sticks and pressing the dead man's button once, s."""
 KEY_HELD_S: Final = 0.1
-"""Maximum time for which a key press counts, s: full deflection since the last poll."""
+"""Maximum time, s, for which a key press counts as full deflection since the last poll."""
 
 
 class Key(Enum):
@@ -98,7 +98,9 @@ def run(flags: LeadFlags) -> int:
         leader = _Leader(robot, session, simulated="simulator" in fleet.manifest.services)
         ended = _by_pad(pad, leader, console) if pad is not None else _by_keys(leader, console)
         if ended is not Key.STOP:
-            console.print(f"ended: the hand stays, assist fades out in {robot.assist.fade_s:g} s")
+            console.print(
+                f"ended: height and pitch stay, assist fades out in {robot.assist.fade_s:g} s"
+            )
             if pad is not None and pad.gone:
                 raise FleetError(f"{pad.name}: connection lost; plug it in, or bring it into range")
             return 0
@@ -112,7 +114,7 @@ class _Leader:
     """Sends the motion and assist that a person requests."""
 
     def __init__(self, robot: RobotConfig, session: Session, *, simulated: bool) -> None:
-        """Start at the robot's present height and pitch."""
+        """Start at a simulated robot's present height and pitch; raise if the robot is silent."""
         self._hand = session.publisher(topics.OPERATOR_HAND, HandLead) if simulated else None
         self._intents = session.publisher(topics.OPERATOR_INTENT, OperatorIntent)
         self._statuses = session.latest(topics.PLANNER_STATUS, PlannerStatus)
@@ -131,7 +133,7 @@ class _Leader:
         self._sent = 0
 
     def take_hold(self) -> None:
-        """Resume leading, with the present assist instead of the assist requested before."""
+        """Resume leading; reduce the requested assist to at most the present assist."""
         status = self._newest()
         self.pilot.limit_assist(0.0 if status is None else status.assist_n)
 
@@ -212,7 +214,7 @@ def _by_pad(pad: Gamepad, leader: _Leader, console: Console) -> Key | None:
 
 
 def _by_keys(leader: _Leader, console: Console) -> Key | None:
-    """Lead with the keyboard until it ends; return STOP after the emergency stop."""
+    """Lead with the keyboard until q, a stop or a signal; return STOP if stopped."""
     stop = StopFlag()
     with Keyboard(KEYS) as keyboard:
         if not keyboard.present:
@@ -235,7 +237,7 @@ def _by_keys(leader: _Leader, console: Console) -> Key | None:
                 last = now
                 shown.update(leader.describe("led"))
         if not keyboard.present:
-            raise HungUpError("the terminal has closed: the hand stays, assist fades out")
+            raise HungUpError("the terminal has closed: height and pitch stay, assist fades out")
     return None
 
 

@@ -18,7 +18,7 @@ from tools.flags import Flags, positional
 
 HOSTS_FILE: Final = "hosts.example.toml"
 _ABOUT_PLANTS: Final = (
-    "# Differences of the true robot from robot.toml, for the simulator: --plant plants/{}.toml\n"
+    "# How the true robot differs from robot.toml, for the simulator: --plant plants/{}.toml\n"
     "# Missing keys have the values of `realistic`, the default without --plant.\n"
 )
 

@@ -61,7 +61,7 @@ class ViewFlags(PortFlags, PartFlags, RunDirFlags):
 
 
 def run(flags: ViewFlags) -> int:
-    """Serve until Ctrl-C."""
+    """Serve until Ctrl-C, or write a record's page."""
     if flags.sim:
         require("sim")
     if flags.record is not None:

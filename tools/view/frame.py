@@ -101,12 +101,12 @@ class Frame(msgspec.Struct, frozen=True):
     torso: Vector3
     """Origin of the torso, m."""
     angles: Vector3
-    """Its roll, pitch, yaw (3-1-2), rad."""
+    """Roll, pitch, yaw of the torso (3-1-2), rad."""
     com: Vector3
     q: tuple[float, ...]
     """Joint angles (12,), rad."""
     q_ref: tuple[float, ...]
-    """Their references (12,), rad; empty without a planner."""
+    """References of the joint angles (12,), rad; empty without a planner."""
     modes: tuple[int, ...]
     """`Mode` of each module; -1 if silent."""
     drives: tuple[int, ...]
@@ -246,7 +246,7 @@ class Newest:
     def estimated_soles(self, q: Sequence[float], tau: Sequence[float]) -> tuple[SoleLoad, ...]:
         """Return the loads of both soles from the joints' torques; empty if a leg is too straight.
 
-        The centre of pressure is away from an ankle by the ankle's torque divided by the load.
+        The centre of pressure is offset from an ankle by the ankle's torque divided by the load.
         """
         self._measured.update(np.array(q), np.zeros(len(q)))
         loads = self._soles.loads(self._measured.leg_loads(np.array(tau)))
@@ -289,7 +289,7 @@ def _shown_soles(loads: Sequence[SoleLoad]) -> tuple[SoleLoad, ...]:
 
 
 def _short(values: Iterable[float]) -> tuple[float, ...]:
-    """Return numbers rounded for the page, which halves their length on the wire."""
+    """Round numbers for the page; this halves their length on the wire."""
     return tuple(round(value, DIGITS) for value in values)
 
 
@@ -309,7 +309,7 @@ CUTS: Final[Mapping[str, tuple[str, ...]]] = {
     "right leg": ("planner->right", "right->planner"),
     "all": ("all",),
 }
-"""Groups of links that a page can cut off from the planner, by name."""
+"""Links to the planner that a page can cut, by the name of the group."""
 CUT_S: Final = 2.0
 
 

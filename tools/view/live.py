@@ -1,6 +1,6 @@
 """Frames of a live fleet, and a page's actions on it.
 
-It subscribes only while a page is open, and acts only if allowed.
+The source subscribes only while a page is open, and acts only if allowed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class LiveOrders:
 
     Attributes:
         services: services that can be killed, frozen and started; the planner first.
-        orders: orders that this fleet accepts; `hand` and `push` only with a simulator.
+        orders: orders that this fleet accepts; `hand` and `push` only with a simulator, `cut` only
+            with a network proxy.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class LiveOrders:
             raise FleetError(f"not stopped: {', '.join(going)}; cut the power")
 
     def _kill(self, order: Order) -> None:
-        # A person requests its next process, which may arm the drive.
+        # a person starts the next process deliberately, so it may arm the drive
         fault = self._fleet.forget(order.service) if order.service in MODULES else ""
         self._fleet.kill(order.service, signal.SIGKILL)
         self._tell(RunEventKind.KILLED, order.service, "KILL")

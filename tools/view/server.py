@@ -20,7 +20,7 @@ from shared.exceptions import FleetError, XrlError
 from tools.view.frame import FRAMES_S, HOST, PAGE, PORT, UPLOT, Order, Source
 
 MESSAGE_MAX: Final = 4096
-"""Largest message of a page, bytes."""
+"""Maximum size of a message from a page, bytes."""
 CLIENTS_MAX: Final = 8
 ORDERS_MAX: Final = 64
 """Maximum number of waiting orders of a page; dragging the torso sends about 60 a second."""
@@ -140,7 +140,7 @@ class ViewServer:
         return socket
 
     async def _send(self, socket: web.WebSocketResponse) -> None:
-        """Send a frame 30 times a second; skip frames while a page does not read."""
+        """Send changed frames, at most 30 a second; skip frames while a page does not read."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         sent = b""

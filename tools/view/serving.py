@@ -57,7 +57,7 @@ async def _serve(source: Source, port: int) -> None:
 
 @contextlib.contextmanager
 def served_beside(run_dir: Path, port: int) -> Iterator[str]:
-    """Serve a running fleet's page, which may act, from another process; end it afterwards."""
+    """Serve a running fleet's page, which may act, from another process; end that process."""
     command = [sys.executable, "-m", "tools.view.serving", str(os.getpid())]
     command += ["view", "--act", "--run-dir", str(run_dir), "--port", str(port)]
     log = run_dir / "logs" / "view.log"
@@ -87,7 +87,7 @@ def served_beside(run_dir: Path, port: int) -> Iterator[str]:
 
 
 def main() -> int:
-    """Run the verb, tied to its parent."""
+    """Run the verb, and end with the parent process."""
     from tools import cli  # noqa: PLC0415 - which loads this module for its verb
 
     parent, *words = sys.argv[1:]

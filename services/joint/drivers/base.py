@@ -20,7 +20,7 @@ HEAT_EVERY_NS: Final = NS_PER_S
 SUPPLY_EVERY_NS: Final = NS_PER_S // 2
 """Period of requests for the supply's voltage, ns."""
 LARGEST: Final = 1e9
-"""Largest target, in any unit; single precision has no fractions long before that."""
+"""Largest target, in any unit; single precision loses all fractions long before that."""
 CELSIUS: Final = (-40.0, 200.0)
 """Valid readings of a thermistor, C; a pin without one reads 0 or an arbitrary value."""
 

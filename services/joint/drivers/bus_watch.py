@@ -49,7 +49,7 @@ class BusWatch:
 
     Attributes:
         echoes: True if the interface returns our frames once they are carried. Otherwise each frame
-            of the drive counts as proof that the bus carries frames.
+            from the drive counts as proof that the bus carries frames.
         unacknowledged: True after our frames were not carried, until one is.
     """
 
@@ -63,7 +63,7 @@ class BusWatch:
         self._can_restart = True
 
     def received(self, now_ns: int) -> None:
-        """Record a frame of the drive."""
+        """Record a frame from the drive."""
         self._heard_ns = now_ns
         if not self.echoes:
             self.carried(now_ns)
@@ -117,7 +117,7 @@ class BusWatch:
         return bool(self._waiting)
 
     def heard_in_order(self, now_ns: int) -> bool:
-        """Record a frame of the drive; return True if the bus needs nothing else in this cycle."""
+        """Record a frame from the drive; return True if the bus needs nothing else this cycle."""
         if not self.echoes:
             self.received(now_ns)
             return True

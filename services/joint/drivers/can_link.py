@@ -73,7 +73,7 @@ def request_of(node_id: int, command: int) -> bytes:
 
 
 class CanLink:
-    """A bus that may be absent: its failures are counted, and look like silence.
+    """A bus that may be absent: its failures look like silence.
 
     If the bus fails, or its controller goes bus-off (too many errors on the wire), the link closes
     it and tries to reopen it every `RETRY_MS`. It sends no frame that would have to wait for a node
@@ -212,8 +212,9 @@ class CanLink:
     def greet(self, packet: bytes) -> None:
         """Send the first requests on a newly opened bus.
 
-        They do not wait for a frame of the drive: their echoes show whether the bus has a node, and
-        whether frames of an earlier process wait. After an outage they wait until the drive sends.
+        They do not wait for a frame from the drive: their echoes show whether the bus has a node,
+        and whether frames of an earlier process wait. After an outage they wait until the drive
+        sends.
         """
         if self.watch.unacknowledged:
             self._greeting = packet
@@ -224,8 +225,8 @@ class CanLink:
     def order(self, packet: bytes, *, proven: bool = False) -> None:
         """Send all frames, in this order.
 
-        A dozen frames may exceed the queue of the interface (ten frames by default). The rest is
-        sent when there is room, within `COMMANDS_MS`. The frames replace a command that still
+        A dozen frames may exceed the queue of the interface (ten frames by default). The others
+        are sent when there is room, within `COMMANDS_MS`. The frames replace a command that still
         waits.
 
         Args:
@@ -301,7 +302,7 @@ class CanLink:
             self._send(greeting)
 
     def _restart(self) -> None:
-        """Discard the frames of any process that wait in the kernel and the adapter."""
+        """Discard all processes' frames that wait in the kernel and the adapter."""
         self._commands = b""
         done = True
         try:

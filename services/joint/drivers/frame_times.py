@@ -15,7 +15,7 @@ would show that it disarmed."""
 ARM_GRACE_MS: Final = 10
 """Time after a command in which heartbeats may predate it and are ignored, ms."""
 FEED_MS: Final = 1000
-"""Time after `arm` in which reading feeds the watchdogs until the drive is ARMED, ms. Only the next
+"""Time after `arm` in which `read` feeds the watchdogs until the drive is ARMED, ms. Only the next
 heartbeat shows ARMED, and a watchdog may expire earlier."""
 INSIST_MS: Final = 1000
 """Time after `idle` in which an axis that still reports closed loop is idled again, ms."""
@@ -109,7 +109,7 @@ class OrderWindows:
 
     Attributes:
         believe_from_ns: heartbeats count from this time on.
-        feed_until_ns: until then, reading feeds the watchdogs.
+        feed_until_ns: until then, `read` feeds the watchdogs.
         insist_until_ns: until then, an axis that is still in closed loop is idled again.
     """
 

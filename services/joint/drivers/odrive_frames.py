@@ -69,7 +69,7 @@ class Rows:
     """Packs the frames that are sent often.
 
     An axis's gains are sent right before its target. The stiffness is the product of both gains. In
-    DAMP, where they change by much, pos_gain falls and is sent first; otherwise the stiffness would
+    DAMP, where they change a lot, pos_gain falls and is sent first; otherwise the stiffness would
     double in between. Setting a mode moves a 0.5 drive's input_pos to the motor's position, so the
     axis's own target follows at once.
     """

@@ -41,8 +41,8 @@ class AxesStatus:
     def judge(self, states: Sequence[int], errors: int) -> DriveStatus:
         """Return the status from `current_state` of both axes and `errors`.
 
-        An axis that left closed loop is an error even without an error bit: OVERSPEED
-        leaves `axis.error` at 0.
+        An axis that left closed loop is an error even without an error bit: up to firmware 0.5.4,
+        OVERSPEED leaves `axis.error` at 0.
         """
         closed = [state == AxisState.CLOSED_LOOP_CONTROL for state in states]
         both = list(zip(self._was_armed, closed, strict=True))
@@ -198,7 +198,7 @@ class OdriveV3:
             self._heat = _EndpointBatch(device, self._both(_THERMISTORS))
 
     async def read_settings(self) -> None:
-        """Read the saved settings of the watchdogs and of the currents' direction."""
+        """Read which watchdogs are enabled, and the currents' direction."""
         enabled = await self._watchdogs.read()
         self._food = [
             self.device.functions[f"{axis}.watchdog_feed"]
@@ -279,6 +279,6 @@ class OdriveV3:
         if missing:
             raise DriveError(
                 f"ODrive {self.device.serial_number}, firmware {self.device.fw_version}: it lacks "
-                f"{missing[0]}; this driver is for an ODrive v3 with firmware 0.5.x"
+                f"{missing[0]}; use an ODrive v3 with firmware 0.5.x"
             )
         return [properties[path] for path in paths]

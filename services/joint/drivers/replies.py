@@ -72,7 +72,7 @@ class Replies:
         return (a, b) if a is not None and b is not None else None
 
     def heat(self) -> tuple[Pair | None, Pair | None]:
-        """Return the thermistor readings of output stages and motors, C, after both replies."""
+        """Return the thermistor readings of output stages and motors, C, once both axes reply."""
         first, second = self._heat
         if first is None or second is None:
             return None, None

@@ -16,9 +16,9 @@ from shared.clock import NS_PER_MS
 GAINS_MS: Final = 100
 """Period at which unchanged gains are sent again, ms."""
 DRIFT_MS: Final = 10
-"""Time after which drifting gains are sent again, ms. Changed gains are sent again with the next
-target, or only after this time if gains were also sent within it before the change: drifting gains
-soon replace a lost frame, and the bus has other traffic."""
+"""Time after which drifting gains are sent again, ms. Changed gains count as drifting if gains were
+also sent within this time before the change: the next ones soon replace a lost frame, and the bus
+has other traffic. Other changed gains are sent again with the next target."""
 SETTLE_MS: Final = 1000
 """Time after `arm` in which limits and modes are sent every `GAINS_MS`, ms. A drive that is taken
 over gets none, because firmware 0.5 disarms if the limit falls below the present current."""

@@ -41,7 +41,7 @@ FAST = 0.04
 """m/s; the integral ignores an error that changes faster, as in a shove and the sway after it. With
 the whole error, a shoved robot swung to the other side twice as far as without an integral."""
 GAIN_MIN = 1e-9
-"""Smaller gains of the body count as zero."""
+"""Smaller gains of the body are not scaled."""
 
 
 class UncoupledGains:

@@ -11,7 +11,7 @@ keeps that wrong stance until it disengages. In later holds, the stance follows 
 So it follows feet that were moved in HOLD, and ignores a sole that lifts briefly in a sway.
 
 Errors in the joints' zeros look like slightly displaced feet, so they become part of the stance.
-The planner refuses a stance beyond `law.stance_max`: no study shows that the robot stands there,
+The planner refuses a stance beyond `law.stance_max`: no study shows that the robot stands in it,
 and a sensor may be broken.
 
 **Slope**, from IMU and joints, as the direction of up in floor axes. The planner's axes are the

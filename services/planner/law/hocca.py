@@ -93,7 +93,7 @@ class LawInputs(NamedTuple):
     toward: Toward = Toward.PERSON
     """Direction in which the robot moves on its own (`services.planner.law.closed_reference`)."""
     released: Released = (False, False)
-    """(height, pitch), each True while nobody leads it."""
+    """(height, pitch), each True to close it in place."""
     pitch_drive: float = 0.0
     """Pitch acceleration measured when the pitch was released, rad/s^2."""
     align: bool = False
@@ -127,7 +127,7 @@ class LawOutput(NamedTuple):
     p_ref: Array
     closure: Array
     assist: float
-    """N"""
+    """Assist plus F_lift, N."""
     slope: Pair
     """Rise of the floor along x and y, rad."""
     stance: Vector6
@@ -238,7 +238,7 @@ class Hocca:
         )
 
     def _measure(self, s: LawState, inputs: LawInputs) -> Array:
-        """Evaluate p, J and pdot in the feet's stance; return the up direction (3,)."""
+        """Evaluate p, J and pdot in the adopted stance; return the up direction (3,)."""
         measured, aligns = self.measured, inputs.align or not s.aligned
         if aligns:
             fraction = min(1.0, inputs.dt / FOLLOW_S) if s.has_led else 1.0

@@ -66,7 +66,7 @@ def leg_geometry(config: RobotConfig) -> tuple[LegGeometry, LegGeometry]:
         foot, knee = (_joint_index(model, kind, side) for kind in ("ankle", "knee"))
         foot_offset = np.array(r_foot) - data.oMi[foot].translation
         screws = data.J[:, 6 + columns].T
-        # the torso's rotation relative to the foot is the reverse of the foot's relative to the
+        # the torso's rotation relative to the foot is the inverse of the foot's relative to the
         # torso
         axes = -screws[:, 3:]
         points = np.cross(axes, -screws[:, :3]) + foot_offset

@@ -83,7 +83,7 @@ class Reference:
     def load(
         self, pdot_ref: Array, F_O: Array, F_assist: Array, assist_rate: Array, D_left: Array
     ) -> None:
-        """Set the inputs of the next `solve` or `evaluate` besides the pose.
+        """Set the inputs of the next `solve` or `evaluate` other than the pose.
 
         The arguments are as in `_ReferenceInputs`; `pdot_ref` in m/s and rad/s.
         """

@@ -1,9 +1,9 @@
 """Decompositions of small matrices by Eigen, without NumPy's checks around each call. Pure.
 
 `np.linalg.solve` of a 12 x 12 system spends most of its 12 us on types, shapes and error states;
-Eigen takes 5 us. Eigenvalues of a 6 x 6 matrix take half of NumPy's time. Pinocchio includes its
-Python bindings. SciPy's LAPACK is as fast, but its import takes 0.37 s, a third of the computing
-time before a restarted planner leads.
+Eigen takes 5 us. Eigenvalues of a 6 x 6 matrix take half of NumPy's time. Pinocchio includes
+Eigen's Python bindings. SciPy's LAPACK is as fast, but its import takes 0.37 s, a third of the
+computing time before a restarted planner leads.
 """
 
 from __future__ import annotations

@@ -92,11 +92,11 @@ class CouplingGains(NamedTuple):
 
 
 UNCERTIFIED_COUPLING: Final = CouplingGains(4.0, 1.0)
-"""Used with the paper's split, which has no schedule, for comparison."""
+"""Used with the paper's split, which has no schedule."""
 
 
 class ScheduledGains:
-    """D over COM height and pitch: bilinear between nodes, constant beyond the last."""
+    """D over COM height and pitch: bilinear between nodes, constant beyond the outer ones."""
 
     def __init__(self, schedule: GainSchedule) -> None:
         self._z, self._pitch = schedule.z, schedule.pitch
@@ -212,7 +212,10 @@ class GainSplit:
     def _stiffen(
         self, D: Array, diagonal: Array, margins: Margins
     ) -> tuple[Array, Margins, SplitSource]:
-        """Return the softest gains that meet the margins, from D to the stiffest allowed."""
+        """Return the first step, from D to the stiffest allowed gains, that meets the margins.
+
+        If no step does, return the stiffest, as UNCERTIFIED.
+        """
         stiff = np.maximum(np.maximum(D, self._stand), self._k_q_fraction_max * diagonal)
         stiff = np.minimum(stiff, self._k_max)
         for fraction in STIFFEN_FRACTIONS:

@@ -172,8 +172,8 @@ def _chains(geometry: tuple[LegGeometry, LegGeometry], feet: list[_Foot], q: ca.
 def _stance(geometry: tuple[LegGeometry, LegGeometry], q: ca.SX) -> ca.SX:
     """Return the stance in which both legs carry the torso to the same pose.
 
-    With the feet as in the robot file, leg i carries it to (R_i, x_i). The feet are then rotated by
-    +-phi/2 and shifted by +-d/2:
+    With the ankles f_i as in the robot file, leg i carries it to (R_i, x_i). The feet are then
+    rotated by +-phi/2 and shifted by +-d/2:
 
         Rot(phi) = R_L R_R^T
         f_R + d/2 + Rot(phi/2) (x_R - f_R) = f_L - d/2 + Rot(-phi/2) (x_L - f_L)
@@ -273,11 +273,12 @@ def _hessian(
     """Return d(J^T F + J_harness^T F_harness)/dq, symmetric, block diagonal: docs/law.md (20).
 
     Each leg's share of the wrench is constant. A change of the sharing with q only moves forces
-    between the legs, which do no work along the closed chain. For joint j below joint k,
-    dJ_k/dq_j = a_j x J_k and da_k/dq_j = a_j x a_k. The symmetric part for a moment is its second
-    derivative by the torso's rotation vector. Automatic differentiation gives the curvature of the
-    angles and of the arm to the harness point over that rotation; half of it is added to each leg.
-    Along the closed chain (J T = I, C T = 0) T^T H T is then exact: -F . d2q/dp2.
+    between the legs; these do no work along the closed chain. For joint j below joint k,
+    dJ_k/dq_j = a_j x J_k and da_k/dq_j = a_j x a_k. For a moment, the symmetric part is the second
+    derivative with respect to the torso's rotation vector. Automatic differentiation gives the
+    curvature of the angles and of the arm to the harness point over that rotation; half of it is
+    added to each leg. Along the closed chain (J T = I, C T = 0) T^T H T is then exact:
+    -F . d2q/dp2.
     """
     torso_fraction = config.torso_mass / config.total_mass
     knee_force = config.mass.module / config.total_mass * F[:3]
@@ -305,7 +306,7 @@ def _hessian(
 
 
 def _by_rotation(config: RobotConfig, rotation: ca.SX, F: ca.SX, F_harness: ca.SX) -> ca.SX:
-    """Return the Hessian (3, 3) of the work of F and F_harness by a small rotation.
+    """Return the Hessian (3, 3), over a small rotation, of the work of F and F_harness.
 
     The work is moment . angles + F_harness . arm, plus the torso's share of the force times its
     centre of mass.

@@ -77,7 +77,7 @@ class ControllerGuard:
             state: state of this guard; updated in place.
             seen: observation of this tick; its `time_s` is set here.
             leads: True if the planner leads; otherwise the controller is reset, and the shipped
-                law's output is returned, which starts at the measured pose.
+                law's output is returned.
         """
         law = seen.law
         state.time_s = state.time_s + seen.dt if leads else 0.0
@@ -115,7 +115,7 @@ class ControllerGuard:
         )
 
     def _rested(self, state: GuardState, seen: Observation) -> LawOutput:
-        """Return the shipped law's output, marked uncertified after an objection until calm."""
+        """Return the shipped law's output, marked uncertified while a hold time runs."""
         if state.why:
             x, y = capture_point(seen.p.tolist(), seen.pdot.tolist(), seen.law.slope)
             calm = abs(x) <= CALM * self._room[0] and abs(y) <= CALM * self._room[1]

@@ -42,7 +42,7 @@ FORGET_NS: Final = 25 * NS_PER_S
 20 s, seven dropouts would fit into a minute."""
 
 _NOT_TRACKABLE: Final = (Mode.FAULT, Mode.DAMP)
-"""Modes from which no module returns to TRACK, so waiting is useless."""
+"""Modes from which no module returns to TRACK by itself, so waiting is useless."""
 _DROPPED: Final = (
     PlannerMode.WAITING, PlannerMode.ALIGNING, PlannerMode.TRIPPED, PlannerMode.UNCERTIFIED,
 )  # fmt: skip
@@ -95,7 +95,7 @@ class Engagement(msgspec.Struct):
         return changed
 
     def wait_ns(self, now_ns: int) -> int:
-        """Return the remaining wait after dropouts, ns; 0 if the planner may engage."""
+        """Return the remaining wait after dropouts, ns; 0 if it is over."""
         return max(0, self.dropouts.last_ns + WAITS_NS[self.dropouts.count] - now_ns)
 
     def _next(
@@ -180,7 +180,7 @@ class RivalWatch(msgspec.Struct):
         )
 
     def announces(self, now_ns: int) -> bool:
-        """Return True if an announcement is due while yielding."""
+        """Return True if an announcement is due, and start its next period."""
         due = now_ns - self.announced_ns >= ANNOUNCE_NS
         if due:
             self.announced_ns = now_ns
@@ -211,7 +211,7 @@ class LimpLegWatch(msgspec.Struct):
     """Watch over modules that are DISARMED while their drives do not hold."""
 
     since_ns: tuple[int, ...] = (0,) * N_MODULES
-    """Time from which each module is in that state; 0 if it is not."""
+    """Time from which each module has been in that state; 0 if it is not."""
 
     def advance(self, now_ns: int, states: Sequence[JointState]) -> Support:
         """Return the modules that must stiffen.

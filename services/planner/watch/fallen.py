@@ -7,7 +7,7 @@ standing robot sink to the floor. No sign counts alone: two must be present for 
     apart     the two legs disagree about the torso by more than `APART_MAX`: a sole is up
     whirled   by the IMU's gyroscope, that plane turned faster than `WHIRL_MIN` a moment ago
     turned    the torso is turned on its legs farther than a person leads it
-    tipped    a sole's pressure was near its edge a moment ago, while both soles bore the robot
+    tipped    a sole's pressure was near its edge a moment ago, while the soles bore the robot
     unloaded  the soles bear less than `UNLOADED` of the weight
 
 With an IMU, one of the two must be `tilted` or `apart`. Without an IMU, the fall of a robot that
@@ -85,7 +85,7 @@ class FallState(msgspec.Struct):
     """State of `FallWatch`."""
 
     since_ns: int = 0
-    """Time from which two signs are present; 0 if they are not."""
+    """Time from which two signs have been present; 0 if they are not."""
     tipped_ns: int = 0
     """Time at which a sole last tipped."""
     whirled_ns: int = 0

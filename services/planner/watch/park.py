@@ -56,7 +56,7 @@ AWAY: Final = (3.0, 1.0)
 """N and N m; any hand on the harness is stronger."""
 AWAY_NS: Final = NS_PER_S // 2
 PULL: Final = 25.0
-"""N along the floor."""
+"""N along the torso's x or y."""
 PULL_NS: Final = 400 * NS_PER_MS
 
 

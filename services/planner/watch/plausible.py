@@ -6,8 +6,8 @@
 support beyond the robot file and the wrench counts as load (`services.planner.law.load`). A load
 hardly ever changes while a person wears the robot, but a sensor can fail: a cell drifts, sticks or
 changes sign. From the first lead on, the load must therefore stay within `CHANGE_MAX` of its first
-value. In 40 drawn leads it changed by at most 1.0 kg and 2.3 N m, although the persons' weight on
-the harness differed from the assist by 24 N.
+value. In 40 leads drawn at random it changed by at most 1.0 kg and 2.3 N m, although the persons'
+weight on the harness differed from the assist by up to 24 N.
 
 The planner ignores a distrusted wrench: it does not estimate the load from it or ease the lead. The
 assist cannot be checked then, so it fades within `EASE_S`. A new zero (`xrl drive tare`) or a
@@ -31,7 +31,7 @@ from shared.joints import N_MODULES
 BEYOND_RAD: Final = 0.5
 """Largest angle beyond a soft stop, from the joint's elasticity or an error of its zero."""
 SPEED_MAX: Final = 100.0
-"""rad/s, five times the speed at which a drive limits its motor."""
+"""rad/s of a joint, about five times the speed that the drives allow it."""
 TURN_MAX: Final = 100.0
 """rad/s, three times the range of the IMU in `docs/bring-up.md`; faster than any torso turns."""
 UNIT_ERROR: Final = 0.1
@@ -72,7 +72,7 @@ class Plausible:
         )
 
     def is_attitude(self, attitude: Attitude) -> bool:
-        """Return True if up is a unit vector and the rate is within `TURN_MAX`."""
+        """Return True if up is a unit vector (shorter if invalid), the rate within `TURN_MAX`."""
         length = math.hypot(*attitude.up)
         return (
             (not attitude.valid or abs(length - 1.0) <= UNIT_ERROR)

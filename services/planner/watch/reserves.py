@@ -78,7 +78,7 @@ class HeatWatchState(msgspec.Struct):
     lifted: float | None = None
     """Upward force of the person on the robot in the last tick, N; None if unknown."""
     hottest: int = 0
-    """Module of `left_s`; while the robot stays straight, the one for which it stood up."""
+    """Module of `left_s`; while height and pitch are closed, updated only below `heat.ease_s`."""
 
     @property
     def moves(self) -> bool:
@@ -100,7 +100,7 @@ class HeatWatch:
         requested: float,
         dt: float,
     ) -> HeatDecision:
-        """Advance by one tick.
+        """Advance by one tick; return the action.
 
         Args:
             s: state of this watch; updated in place.

@@ -22,12 +22,12 @@ A trip makes all six modules hold. No single joint service can detect these faul
 
 The planner checks the trips while it is engaged. `unloaded` counts only once both legs have carried
 the torso, because on a hoist neither does. `sagging` counts only once the person has stopped
-pressing, because a hand that HOLD held up first catches up. HOLD may leave the COM off its
-reference, and the leading planner brings it back, so `balance` counts only an offset that grows by
-`ROOM`. A trip ends when every value has been within its limit for `CALM_NS` and the tripped value
-was known throughout: a silent harness does not end a trip on its force. A trip counts as a dropout
-(`services.planner.watch.engagement_fsm`): after repeated trips the planner waits ever longer before
-it re-engages.
+pressing, because a hand that pressed against HOLD first catches up. HOLD may leave the COM off its
+reference, and the leading planner brings it back, so `balance` counts only an offset that has grown
+by `ROOM`. A trip ends when every value has been within its limit for `CALM_NS` and the tripped
+value was known throughout: a silent harness does not end a trip on its force. A trip counts as a
+dropout (`services.planner.watch.engagement_fsm`): after repeated trips the planner waits ever
+longer before it re-engages.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ class TripsState(msgspec.Struct):
     """State of `PlannerTrips`."""
 
     since_ns: tuple[int, ...] = (0,) * len(PLANNER_TRIPS)
-    """Time from which each value is beyond its limit; 0 if it is not."""
+    """Time from which each value has been beyond its limit; 0 if it is not."""
     calm_ns: int = 0
-    """Time from which no value is beyond its limit."""
+    """Time from which no value has been beyond its limit; 0 otherwise."""
     tripped: Trip = Trip.NONE
     """Active trip, which prevents the planner from engaging."""
     why: str = ""
@@ -195,8 +195,8 @@ def _assist_error(lifted: float | None, assist: float, *, leads: bool) -> float:
 def _pressing_power(lifted: float | None, assist: float, rate: float, *, leads: bool) -> float:
     """Return the power with which the person presses the robot down, W; NaN if unknown.
 
-    It is exactly zero for loads up to `LEADING_LOAD`. In HOLD nothing sinks, so the power is that
-    of the load at `ASSUMED_SINK_RATE`.
+    It is exactly zero for loads up to `LEADING_LOAD` beyond the assist. In HOLD nothing sinks, so
+    the power is that of the load at `ASSUMED_SINK_RATE`.
     """
     if lifted is None:
         return math.nan

@@ -13,7 +13,7 @@ compares the rate with c, the rate when the hand left. c decays with `COAST_S` o
     released   if |excess + STOP_S (rate - c)| > RUNAWAY
 
 A released direction is closed (`services.planner.law.closed_reference`) until a hand returns. If a
-hand was there after all, too light to be detected, it meets a resistance and opens the direction. A
+hand was there after all, too light to be detected, it meets resistance and opens the direction. A
 pitch that stays released for `PROOF_NS` shows that nobody holds the robot. The height is then
 closed too, so that the weight of a resting person cannot move it. A hand on the pitch opens both.
 Further motion is drift, which trips:
@@ -37,8 +37,8 @@ HAND_MIN: Final = (3.0, 1.0)
 """N and N m; noise and zero offsets are smaller, a leading hand is stronger (dry friction alone
 takes 6 N)."""
 TOUCH_MIN: Final = (3.0, 0.25)
-"""N and N m; twice the noise. In 6 of 31 drawn leads, the feedforward drove the torso, and the hand
-that guided it needed less than 1 N m for seconds."""
+"""N and N m; twice the noise. In 6 of 31 leads drawn at random, the feedforward drove the torso,
+and the hand that guided it needed less than 1 N m for seconds."""
 COAST_S: Final = 0.5
 """Time constant of c, s. Friction stops a torso 0.3 s after a hand leaves it at 0.4 rad/s."""
 HAND_LOST_NS: Final = NS_PER_S // 2
@@ -46,7 +46,7 @@ HAND_LOST_NS: Final = NS_PER_S // 2
 ARM: Final = 0.25
 """m per rad of the torso's pitch."""
 RUNAWAY: Final = (0.0075, 0.04)
-"""m and rad; 30 of 31 drawn leads stayed within 0.002 m and 0.04 rad."""
+"""m and rad; 30 of these 31 leads stayed within 0.002 m and 0.04 rad."""
 STOP_S: Final = 0.1
 """s; the closed directions stop a drift of 1 rad/s within 0.1 rad."""
 HAND_BACK: Final = (25.0, 1.0)
@@ -55,8 +55,8 @@ an assist, which differs from the weight on the harness by at most 24 N."""
 HAND_BACK_NS: Final = 50 * NS_PER_MS
 """ns; minimum duration of a force that opens a released direction; a bump is shorter."""
 PROOF_NS: Final = 120 * NS_PER_MS
-"""ns; most hands that lead the pitch are detected sooner. In 5 of 60 drawn leads the hand was not
-detected, and its peak force rose by 5 to 32 N."""
+"""ns; most hands that lead the pitch are detected sooner. In 5 of 60 leads drawn at random the hand
+was not detected, and its peak force rose by 5 to 32 N."""
 
 
 class _OpenDirection(msgspec.Struct):

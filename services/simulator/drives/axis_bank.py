@@ -2,8 +2,8 @@
 
 It emulates firmware 0.5.6 with its traps. OVERSPEED disarms in torque mode too. A disarmed axis
 floats while its sibling keeps its torque. The watchdog runs in IDLE too. Re-arming does not zero
-`input_torque`. Setting position mode moves `input_pos` to the motor's position. An axis can be in
-IDLE with `axis_error` 0. An axis whose encoder fails stays armed for 51 ms and misses the turns
+`input_torque`. Setting position mode moves `input_pos` to the motor's position. An axis can disarm
+with `axis_error` 0. An axis whose encoder fails stays armed for 51 ms and misses the turns
 made meanwhile. A restart restores the saved settings.
 
 Pure: no clock, no I/O. Axes 2i and 2i + 1 are axis0 and axis1 of module i, one ODrive.
@@ -122,7 +122,7 @@ class AxisBank:
 
     @property
     def regulates(self) -> bool:
-        """True if any axis regulates or calibrates, and so needs every step of the world."""
+        """True if any axis regulates or calibrates, and so must step with the world."""
         return bool(self.calibration.running) or self._control.regulates()
 
     def step(self, now_s: float, pos_turns: Vector, vel_turns: Vector) -> Vector:
@@ -305,7 +305,7 @@ class AxisBank:
             self._fail(each, FAULTS[error])
 
     def supply(self, drive: int, volts: float) -> None:
-        """Set an ODrive's supply voltage; it is off below `DEAD_VOLTAGE`, and boots above it."""
+        """Set an ODrive's supply, V: the drive is off below `DEAD_VOLTAGE`, and boots above it."""
         self.bus.supply[drive] = volts
         self.bus.changed()
         if volts < DEAD_VOLTAGE:

@@ -96,7 +96,7 @@ FAULTS: Final[Mapping[str, AxisErrors]] = {
     "WATCHDOG": AxisErrors(AxisError.WATCHDOG_TIMER_EXPIRED),
     "ESTOP": AxisErrors(AxisError.ESTOP_REQUESTED),
 }
-"""Faults of an axis by name, for `AxisBank.inject`; except for `SHARED_FAULTS` the sibling keeps
+"""Faults of an axis by name, for `AxisBank.inject`; except for `SHARED_FAULTS`, the sibling keeps
 its torque. DISARM leads to IDLE without an error.
 """
 

@@ -122,8 +122,8 @@ class Settings:
     """The settings of all drives.
 
     Attributes:
-        version: number of values that were set by name. Code that caches a column compares it to
-            detect a change.
+        version: number of changes made by name. Code that caches a column compares it to detect a
+            change.
     """
 
     def __init__(self) -> None:

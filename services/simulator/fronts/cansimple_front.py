@@ -185,8 +185,9 @@ class CanSimpleFront:
     def _is_lost(self, axis: int) -> bool:
         """Return True if an answer is lost because all three mailboxes of its drive are full.
 
-        They are full for about 0.6 ms while heartbeats and encoder frames of both axes are sent. At
-        1 kHz, 0.6 % of the requests get no answer, and the drive repeats none.
+        They are full for about 0.6 ms while heartbeats and encoder frames of both axes are sent.
+        With encoder frames at 1 kHz, 0.6 % of the requests get no answer, and the drive repeats
+        none.
         """
         sent_s, frames = self._sent[axis >> 1]
         if frames < _MAILBOXES or sent_s != self._bank.now_s:

@@ -1,6 +1,6 @@
 """Native protocol (Fibre, legacy packet format) of the emulated drives (docs/drives.md).
 
-`endpoints` is the part of firmware 0.5.6's tree that this project uses: all settings of the bank by
+`endpoints` returns the part of firmware 0.5.6's tree that this project uses: the bank's settings by
 the firmware's names, measurements, and functions. Units at the motor: turns, turn/s, N m, A, V, C.
 
 `FibreFront` is the protocol of one board: it turns requests into answers, all little-endian.
@@ -82,7 +82,7 @@ class EmulatedBoard(NamedTuple):
         return self.bank.is_responding(self.axis(0))
 
     def save(self) -> None:
-        """Save the configuration, which restarts the board; ignored while an axis is armed."""
+        """Save the configuration, which restarts the board; ignored unless both axes are idle."""
         if all(self.bank.state[self.axis(i)] == AxisState.IDLE for i in AXES):
             self.bank.settings.save(self.drive)
             self.bank.reboot(self.axis(0))

@@ -27,7 +27,7 @@ from shared.joints import N_JOINTS
 from shared.robot.compiled_graph import CompiledGraph
 
 NOISE_ROWS: Final = 4093
-"""Number of noise samples: drawn at the start, then repeated every 4 s at 1 kHz. It is a prime."""
+"""Number of noise samples, a prime: drawn at the start, then repeated every 4 s at 1 kHz."""
 
 
 class Actuation:
@@ -62,7 +62,7 @@ class Actuation:
         self._reads = 0
 
     def settle(self, q: Array) -> None:
-        """Set the rotors to rest at joint angles q (12,), rad."""
+        """Set the rotors to joint angles q (12,), rad, at rest."""
         if self.flexible is not None:
             self.flexible.settle(q)
 
@@ -132,7 +132,7 @@ class FlexibleDrivetrain:
         self._theta_next, self._rate_next, self._tau, self.damping = self._graph.results
 
     def settle(self, q: Array) -> None:
-        """Put the rotors to rest at joint angles (12,), rad."""
+        """Set the rotors to joint angles (12,), rad, at rest."""
         self.theta[:] = q
         self.rate[:] = 0.0
 

@@ -164,7 +164,7 @@ def _set_floor(spec: mujoco.MjSpec, config: RobotConfig, plant: PlantConfig, ank
                 friction=[floor.friction, floor.friction, torsional, rolling, rolling],
                 solref=[floor.contact_time, 1.0], solreffriction=[STICTION_TIME, 1.0],
             )  # fmt: skip
-    for ground in grounds:  # a robot that falls lies on torso and knees
+    for ground in grounds:  # a fallen robot lies on its torso and thighs
         for name in ("torso", *(f"thigh_{side}" for side in SIDES)):
             spec.add_pair(
                 geomname1=ground.name, geomname2=name, condim=3,

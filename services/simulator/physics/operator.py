@@ -22,8 +22,8 @@ from shared.config.sections import OperatorConfig
 BANDWIDTH: Final = 8.0
 """Bandwidth of the critically damped system with which the hand follows requests, rad/s."""
 HEIGHT_MAX_RATE: Final = 0.25
-"""Maximum rate of a led hand's height, m/s: the hand pulls with up to 70 N. At 0.5 m/s it would
-pull with 150 N, the limit of the `harness` trip."""
+"""Maximum rate of a led hand's height, m/s: the hand then pulls with up to 70 N. At 0.5 m/s it
+would pull with 150 N, the limit of the `harness` trip."""
 PITCH_MAX_RATE: Final = 1.0
 """Maximum rate of a led hand's pitch, rad/s."""
 HEIGHTS: Final = (0.78, 1.2)
@@ -159,7 +159,7 @@ class Acting(NamedTuple):
 
 NO_ACT: Final = Acting()
 TREMOR_HZ: Final = 6.0
-"""Frequency of the tremor, Hz; a tremor of effort has 4 to 12 Hz."""
+"""Frequency of the tremor, Hz; tremor under effort has 4 to 12 Hz."""
 RELAXED: Final = 0.25
 _GRIPS: Final = {"relax": RELAXED, "limp": 0.0, "let_go": 0.0}
 

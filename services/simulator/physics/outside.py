@@ -100,7 +100,7 @@ class OutsideForces:
     """
 
     def __init__(self, body: Body, scenario: Scenario, torso: Torso) -> None:
-        """Hold the torso at its present position, by the hoist."""
+        """Hang the torso on the hoist at its present position."""
         self.scenario = scenario
         self._torso = torso
         self._harness_point = body.harness_point

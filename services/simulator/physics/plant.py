@@ -5,8 +5,8 @@ joints with backlash, friction, cogging, delayed torque, encoder noise, wrong ze
 sloped floor, displaced feet and a person with a mass. Only the simulator reads the plant
 (`tests/test_architecture.py`).
 
-`PlantConfig()` is the default, realistic; `IDEAL` is rigid and has no errors. A TOML file or
-`--plant KEY=VALUE` (`plant_from`) changes single values. SI units.
+`PlantConfig()` is the default, realistic; `IDEAL` is rigid, with friction and damping. A TOML file
+or `--plant KEY=VALUE` (`plant_from`) changes single values. SI units.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class EncoderErrors(Section, frozen=True):
     """Errors of the encoders."""
 
     noise_counts: Annotated[float, Range(0.0, 100.0, "counts")] = 0.5
-    """Standard deviation; a capacitive encoder of 16384 counts varies by one count at rest."""
+    """Standard deviation; an encoder of 16384 counts varies by one count at rest."""
     zero_errors: tuple[Angle, ...] = (0.0,) * N_JOINTS
     """Reported minus true angle of each of the 12 joints, rad."""
 
@@ -104,7 +104,7 @@ class Floor(Section, frozen=True):
     """The floor. The world's z axis is the floor's normal, so a slope tilts gravity."""
 
     slope: tuple[Angle, Angle] = (0.0, 0.0)
-    """Rise along x and along y, rad: (0.05, 0) is uphill in front."""
+    """Rise along x and along y, rad: (0.05, 0) is uphill ahead."""
     step: Annotated[float, Range(-0.1, 0.1, "m")] = 0.0
     """Height of the floor under the right foot above the floor under the left foot."""
     friction: Annotated[float, Range(0.05, 2.0, "1")] = 0.8
@@ -166,7 +166,8 @@ IDEAL: Final = PlantConfig(
     floor=Floor(friction=0.9),
     person=Person(mass=0.0, load_scale=1.0, load_lag_s=0.0),
 )
-"""Rigid and without errors; it only shows that the code follows the equations."""
+"""Rigid, without errors except friction and damping; it only shows that the code follows the
+equations."""
 
 NAMED: Final[Mapping[str, PlantConfig]] = {"realistic": PlantConfig(), "ideal": IDEAL}
 
@@ -232,5 +233,5 @@ def _check(file: str, plant: PlantConfig) -> None:
     found = len(plant.encoder.zero_errors)
     if found != N_JOINTS:
         raise ConfigError(
-            file, "encoder.zero_errors", f"{found} values", f"must be {N_JOINTS}, in rad"
+            file, "encoder.zero_errors", f"{found} values", f"give {N_JOINTS}, in rad"
         )

@@ -201,7 +201,7 @@ class World:
                 self._fallen = True
 
     def motor_turns(self) -> tuple[Array, Array]:
-        """Return motor positions (12,) in turns and rates (12,) in turn/s.
+        """Return the encoders' positions (12,), turns, and the motors' rates (12,), turn/s.
 
         Order: axis0, axis1 of each module in `MODULES` order.
         """

@@ -61,7 +61,7 @@ def test_feet_that_have_crept_for_an_hour_take_the_com_with_them(
     [
         ({"fallen": True}, "it has fallen"),
         ({"com": (0.13, 0.0, 1.0)}, "beyond the soles"),
-        ({"foot_left_tilt": 0.06}, "a sole has lifted"),
+        ({"foot_left_tilt": 0.06}, "a sole is tilted"),
         ({"angles": (0.0, -0.6, 0.0)}, "turned"),
         ({"angles": (0.0, 1.7, 0.0)}, "turned"),
         ({"angles": (0.31, 0.0, 0.0)}, "turned"),
@@ -168,7 +168,7 @@ def test_a_time_to_hold_that_was_not_measured_is_a_dash(log: RunLog) -> None:
     [
         ({"stood": True, "sound": True}, 0),
         ({"fallen_at_s": 2.0}, 1),
-        ({"why_not": "a sole has lifted, by 0.06 rad"}, 1),
+        ({"why_not": "a sole is tilted by 0.06 rad"}, 1),
         ({"stood": True, "unsound": "torque at its limit: 90 ms (limit 50)"}, 3),
         ({}, 3),
     ],

@@ -198,7 +198,7 @@ def test_an_authority_that_is_not_there_or_another_robots_is_refused(
         config_file.to_toml(msgspec.structs.replace(other, name="other")), encoding="utf-8"
     )
     assert made.xrl("renew", "--all") == 2
-    assert "authority of 'xrl'; give that of 'other'" in capsys.readouterr().err
+    assert "authority of 'xrl'; give the authority of 'other'" in capsys.readouterr().err
     elsewhere = made._replace(authority=made.authority / "nowhere")
     assert elsewhere.xrl("renew", "--all") == 2
     assert "names.toml is missing" in capsys.readouterr().err

@@ -140,11 +140,11 @@ def test_each_reason_to_give_up_says_what_helps(robot: RobotConfig) -> None:
     damped = stand(robot, mode=int(Mode.DAMP))
     for said, words in (
         (gives_up(law(), [None] * 6, None, HEARD_S + 0.5), "ankle_right, knee_right, hip_right, "),
-        (gives_up(law(), faulty, None, 3.0), "ankle_right FAULT: the other modules may carry"),
+        (gives_up(law(), faulty, None, 3.0), "ankle_right FAULT: the legs may still carry"),
         (gives_up(law(), standing, tripped, PATIENCE_S + 3.0), "does not lead (OVERLOADED)"),
         (gives_up(law(), standing, planner_status(), STALLED_S + 3.0), "robot is held up at a COM"),
         (gives_up(law(), standing, None, HEARD_S + 3.0), "not all modules go to DAMP"),
-        (gives_up(law(), damped, None, 60.0), "down, but the robot may still bear weight"),
+        (gives_up(law(), damped, None, 60.0), "down, but the legs may still carry the robot"),
     ):
         assert words in said
         assert "--limp" in said or "take the hand off" in said

@@ -58,9 +58,7 @@ def test_margins_above_what_the_planner_asks_for_are_printed(
     path, said = unladen
     certificate = config_file.load(path).certificate
     spoken = " ".join(said.split())
-    found = re.search(
-        r"smallest margin[^:]*: ([\d.]+) of the required one.*?, ([\d.]+) with", spoken
-    )
+    found = re.search(r"smallest margin[^:]*: ([\d.]+) with.*?, ([\d.]+) with", spoken)
     assert found, said
     assert float(found[1]) > certificate.margin_min
     assert float(found[2]) > certificate.onboard_margin_min

@@ -29,7 +29,7 @@ LIBRARY: Final = VENDOR / "uPlot.iife.min.js"
 SCRIPT: Final = HERE / "page.js"
 POINTS: Final = 4000
 """Maximum number of points of a line: the minimum and maximum of each interval, so that a plot
-shows every extreme and the page of an hour has 2 MB."""
+shows every extreme and the page of an hour takes 2 MB."""
 BEFORE_S: Final = {"fall": 3.0}
 """Time before an event that a click on it shows, s; 0.5 for the other kinds."""
 HELP: Final = (

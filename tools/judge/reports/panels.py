@@ -234,7 +234,7 @@ def _torques(run: RunData) -> Panel:
         lines.append(Line(module, t, tau, number, beyond=beyond))
     return Panel(
         "Torque of each module", "N m",
-        "|tau_phi| + |tau_theta|: both motors of a module act along one axis.",
+        "|tau_phi| + |tau_theta|: proportional to the torque of the more loaded motor.",
         lines=lines,
         levels=[Level(most, "limit")] if np.isfinite(most) else [],
     )  # fmt: skip

@@ -40,7 +40,7 @@ class _RunVerdict(NamedTuple):
 
 
 class Judge:
-    """Judges a run from its parts, in order, in the words of the command that made it."""
+    """Judges a run from its parts, in order, in the words of the command that ran it."""
 
     def __init__(self) -> None:
         self._summaries: list[Summary] = []

@@ -216,7 +216,7 @@ def _run_module(end: End, name: str, begin_ns: int, end_ns: int) -> tuple[list[f
 
 
 def _run_planner(end: End, _name: str, _begin: int, end_ns: int) -> tuple[list[float], int]:
-    """Send six commands whenever six new states have arrived."""
+    """Send six commands once six new states have arrived, or after 1.25 ticks."""
     takes = [end[1](f"state_{module}") for module in MODULES]
     puts = [end[0](f"command_{module}") for module in MODULES]
     fresh, last_ns = set[int](), 0

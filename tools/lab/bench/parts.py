@@ -135,7 +135,7 @@ def record(robot: RobotConfig, scenario: Scenario) -> Recorded:
 
 
 class _KeptManager(DriveManager):
-    """A drive manager that keeps its inputs."""
+    """A drive manager that keeps its inputs and actions."""
 
     def __init__(self, config: RobotConfig, name: str) -> None:
         super().__init__(config, name)
@@ -323,7 +323,7 @@ def _lockstep_speed(robot: RobotConfig, scenario: Scenario, writer: RunWriter | 
 
 
 def _writer(robot: RobotConfig, stack: ExitStack) -> RunWriter:
-    """Open a log in a temporary folder, as the recorder does."""
+    """Open a log as the recorder does, but in a temporary folder."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xrl-bench-")))
     return stack.enter_context(
         RunWriter(

@@ -139,7 +139,7 @@ def run_turns(
 
 
 def _turn_of(tree: Path, words: Sequence[str], config: Path) -> Turn:
-    """Return one turn of a tree's own bench, with its own version of this checkout's robot file."""
+    """Return one turn of a tree's own bench, with that tree's version of a robot file in it."""
     config = config.resolve()
     if config.is_relative_to(CHECKOUT):
         config = tree / config.relative_to(CHECKOUT)
@@ -169,7 +169,7 @@ def unpacked(revision: str) -> Iterator[Path]:
             raise RunError(f"{revision}: no such git revision ({reason}); try one such as HEAD~1")
         with tarfile.open(archive) as packed:
             packed.extractall(tree)  # noqa: S202 - the archive is git's own
-        with suppress(RunError):  # without the libraries CasADi interprets its law
+        with suppress(RunError):  # without these libraries, CasADi interprets the law
             run_tree(tree, [], "tools.graph_libraries")
         yield tree
 

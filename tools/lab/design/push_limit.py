@@ -54,7 +54,7 @@ class _PushLimit(NamedTuple):
     """The largest push along one direction."""
 
     force_n: float
-    """0 if the pose does not stand even without a push."""
+    """0 if the robot cannot hold the pose even without a push."""
     part: str
     """The limit reached first, such as "left sole's outer edge"."""
 
@@ -95,7 +95,7 @@ class _Limit(NamedTuple):
 
 
 class LoadedStand:
-    """Torques and wrenches of one pose under its own weight, and their change with a push."""
+    """Torques and wrenches of one pose under the robot's weight, and their change with a push."""
 
     def __init__(self, config: RobotConfig, kinematics: Kinematics, T: Array, H: Array) -> None:
         """Compute the loads of the pose at which the kinematics was updated.
@@ -199,7 +199,7 @@ class LoadedStand:
         return beyond._replace(force_n=until_n + beyond.force_n)
 
     def _hardest(self, response: Response | None, borne: Array) -> _PushLimit:
-        """Return the largest push that torques and soles carry beside the load `borne` (24,)."""
+        """Return the largest push that torques and soles carry on top of the load `borne` (24,)."""
         if response is None:
             return _PushLimit(0.0, "the stiffness")
         before = borne + np.concatenate((self._tau, self._soles(self._W)))

@@ -346,7 +346,7 @@ class SampledLoop:
         return Growth(rate, abs(np.angle(worst)) / (2.0 * math.pi * period))
 
     def impedance_z(self, w: float) -> complex:
-        """Return force over velocity of the harness point, N s/m, for a hand that moves it at w.
+        """Return force over velocity at the harness point, N s/m, for a hand that oscillates at w.
 
         w is in rad/s. Valid only for the half with z. The force acts along the world's z.
         """

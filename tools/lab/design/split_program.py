@@ -1,4 +1,4 @@
-"""Computes the certified gain schedule offline, run by `xrl gains` (docs/law.md#gain-split).
+"""Computes the certified gain schedule offline, for `xrl gains` (docs/law.md#gain-split).
 
 The grid spans COM height and torso pitch. At each node, the local stiffnesses D of one leg solve a
 semidefinite program; the other leg is alike:
@@ -14,7 +14,7 @@ and with the full assist. K_geo is linear in the assist, so every assist in betw
 Damping and coupling are chosen with the dynamic certificate, one set for all nodes:
 
     minimise    effort of the hand in a squat [N] + SWAY_WEIGHT (rate of sway + DECAY_WANTED)+
-    subject to  every condition of `tools.lab.design.dynamic_certificate`
+    subject to  every TRACK condition of `tools.lab.design.dynamic_certificate`
 
 The rate of sway, 1/s, is negative if the sway decays. The variables are the six local dampings of
 a leg, and bandwidth and damping of tau_coupled, all on a ladder of ratios. The method is coordinate
@@ -75,7 +75,7 @@ STEP: Final = 1.25
 ROUNDS: Final = 3
 START: Final = Design((40.0, 30.0, 40.0, 8.0, 40.0, 6.0), CouplingGains(3.0, 2.125))
 LEAD_HZ: Final = 0.3
-"""Frequency of the computed effort: between the squat's 0.2 Hz and a quick person's."""
+"""Frequency at which the effort is computed: between the squat's 0.2 Hz and a quick person's."""
 LEAD_M_S: Final = 0.15
 """Speed of the hand in the reference squat, m/s."""
 NOMINAL_STIFFNESS: Final = 8000.0

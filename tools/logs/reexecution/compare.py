@@ -1,6 +1,6 @@
 """Bit-for-bit comparison of recorded and recomputed outputs, and reasons for differences.
 
-The likely reason is a difference between the run's environment and the present one.
+Likely reasons are differences between the run's environment and the present one.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class ReexecutionResult:
         ticks: number of executed cycles or ticks.
         skipped: number of cycles or ticks before the first snapshot in the log, or after a loss.
         starts: number of starts from a recorded snapshot.
-        lost_inputs: number of messages that the service used and the log lacks.
+        lost_inputs: number of cycles or ticks for which the log lacks an input.
         comparison: comparison of the outputs.
     """
 
@@ -235,7 +235,7 @@ def likely_reason(recorded: Origin, here: Origin) -> str:
     if differing:
         line = f"likely reason: recorded with {'; '.join(differing)}"
     else:
-        line = "no reason known: it was recorded with the same environment as here"
+        line = "no reason known: recorded in the same environment"
     return f"{line} (unknown: {', '.join(untold)})" if untold else line
 
 

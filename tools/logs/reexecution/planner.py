@@ -34,7 +34,7 @@ class _BySeq(Generic[M]):
             self._rows.setdefault(message.seq, []).append(message)
 
     def at(self, seq: int, by_ns: int) -> M | None:
-        """Return the newest message with this number up to a time, or None."""
+        """Return the newest message with this number up to a time, else the oldest, or None."""
         rows = self._rows.get(seq)
         if not rows:
             return None

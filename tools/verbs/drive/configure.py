@@ -87,7 +87,7 @@ class ConfigureFlags(FleetRobotFlags):
         """Refuse flags that need --calibrate or contradict it."""
         super().check()
         if (self.again or self.yes) and not self.calibrate:
-            raise DriveError("--again and --yes need --calibrate")
+            raise DriveError("--again and --yes need --calibrate; add it")
         if self.calibrate and self.restore:
             raise DriveError("--calibrate and --restore cannot be combined; remove --restore")
 
@@ -164,7 +164,9 @@ def _write(
     if interrupts.number:
         begun = {outcome.change.module for outcome in outcomes}
         rest = dict.fromkeys(c.module for c in difference if c.module not in begun)
-        console.print(f"stopped before {', '.join(rest)}" if rest else "stopped after the last one")
+        console.print(
+            f"stopped before {', '.join(rest)}" if rest else "stopped after the last board"
+        )
         exit_if_interrupted(interrupts)
     if code or not axes:
         return code
@@ -278,7 +280,7 @@ def apply(
     difference: Sequence[SettingChange],
     interrupts: Interrupts,
 ) -> list[ChangeResult]:
-    """Write, save and read back one board's settings after another's; continue after a failure.
+    """Write, save and read back the settings of one board after another, even after a failure.
 
     A board is finished before an interrupt takes effect: otherwise half of its settings would be
     active and none saved.

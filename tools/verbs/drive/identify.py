@@ -100,7 +100,7 @@ def run(flags: IdentifyFlags) -> int:
 
 
 def report(estimates: Sequence[Estimate], console: Console) -> None:
-    """Print the estimates, and the line to write into the robot file if it has to change."""
+    """Print the estimates and, if the armature has to change, the line for the robot file."""
     table = Table(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)  # in 80 columns
     table.add_column("")
     for heading in ("robot file", "measured", "95 %"):

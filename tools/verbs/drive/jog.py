@@ -48,7 +48,7 @@ xrl drive jog knee_left --torque-limit 30     # if its load needs more
 TRAVEL_SHARE: Final = 0.25
 """Maximum error of the travel, as a fraction of the requested travel."""
 LAG_MAX: Final = 0.02
-"""Maximum lag behind the reference, rad, without the deflection by the load at rest."""
+"""Maximum lag behind the reference, rad, besides the deflection under the load at rest."""
 SIBLING_MAX: Final = 0.02
 """Maximum motion of the other axis, rad."""
 
@@ -61,7 +61,7 @@ class JogFlags(MotionFlags):
     axis: Annotated[str, Arg(choices=AXES)] = "theta"
     """axis to move"""
     by: Annotated[float, Range(-BY_MAX, BY_MAX, "rad")] = BY
-    """distance out and back; positive theta leans the part above forward"""
+    """distance one way; positive theta leans the part above forward"""
     period: Annotated[float, Range(PERIOD_MIN_S, 60.0, "s")] = PERIOD_S
     """time of one motion out and back"""
     cycles: Annotated[int, Range(1, CYCLES_MAX, "")] = CYCLES
@@ -141,17 +141,17 @@ def report(moved: Moved[ThereAndBack], module: str, console: Console) -> int:
 
 
 class ThereAndBack(NamedTuple):
-    """Repeated motion by/2 (1 - cos) along the axis."""
+    """Repeated motion by/2 (1 - cos) about the axis."""
 
     by: float
-    """Distance there and back, rad."""
+    """Distance one way, rad."""
     period_s: float
     """Period of one motion there and back, s."""
     cycles: int
 
     @property
     def duration_s(self) -> float:
-        """Duration of all cycles."""
+        """Duration of all cycles, s."""
         return self.cycles * self.period_s
 
     @property
@@ -234,7 +234,7 @@ def judge(samples: list[Sample], plan: JogPlan) -> list[JogCheck]:
 
 
 def friction(moving: list[Sample], plan: JogPlan) -> float:
-    """Return half the difference of the mean torques on the way there and on the way back, N m.
+    """Return half the difference between the mean torques there and back, N m; NaN if unknown.
 
     Uses only the fast part of the motion; the torques of gravity and springs cancel.
     """

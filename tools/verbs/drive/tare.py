@@ -48,7 +48,9 @@ def run(flags: TareFlags) -> int:
         wrenches = session.latest(topics.WRENCH, Wrench)
         before = tare(requests, wrenches, anyway=flags.anyway)
     read = describe(before) if before.valid else "no valid wrench"
-    Console().print(f"the harness is tared: its present reading is zero; the old one was {read}")
+    Console().print(
+        f"the harness is tared: its present reading is zero; the old reading was {read}"
+    )
     return 0
 
 
@@ -77,7 +79,7 @@ def tare(requests: Outbox[TareRequest], wrenches: Inbox[Wrench], *, anyway: bool
 
 
 def describe(wrench: Wrench) -> str:
-    """Return a wrench's magnitude as text."""
+    """Return a wrench's magnitudes as text."""
     return f"{math.hypot(*wrench.force):.1f} N, {math.hypot(*wrench.moment):.1f} N m"
 
 

@@ -82,7 +82,7 @@ class ZeroFlags(FleetRobotFlags):
     and --standing then need only be within 0.08 rad; unclear results are refused"""
     untouched: bool = False
     """with --resume, for joints that have moved: you confirm that no encoder, magnet, motor or
-    encoder cable has been touched since the zero"""
+    encoder cable has been touched since the last zeroing"""
     swing: bool = False
     """with --resume, for knees and hips that have moved: check by the legs' swing that they hang
     free"""
@@ -124,7 +124,9 @@ def run(flags: ZeroFlags) -> int:
     with drive_access.drives_to_ourselves(robot, path, flags.run_dir, console.print) as started:
         if flags.rest:
             kept = zero_record.store_rests(robot, path, flags.run_dir, modules, console.print)
-            console.print(f"{kept} of {len(modules)} modules rest; their positions are stored")
+            console.print(
+                f"{kept} of {len(modules)} modules are at rest; their positions are stored"
+            )
             return 0 if kept == len(modules) else FAULT_EXIT_CODE
         refuse_services(robot, holders)
         known = zero_record.identities(robot, flags.run_dir, modules, console.print)
@@ -318,7 +320,7 @@ class _Zeroing(NamedTuple):
 
 
 def _angles_of(flags: ZeroFlags, robot: RobotConfig, console: Console) -> dict[str, Pair]:
-    """Return the position (phi, theta), rad, of each selected module, inside its limits."""
+    """Return the given (phi, theta), rad, of each selected module; raise if outside its limits."""
     wanted: dict[str, Pair] = {}
     if flags.at is not None:
         wanted = dict.fromkeys(flags.modules, flags.at)
@@ -374,7 +376,7 @@ def refuse_services(robot: RobotConfig, holders: Mapping[str, SupervisedFleet | 
 def _states(
     robot: RobotConfig, fleet: SupervisedFleet, modules: list[str]
 ) -> dict[str, JointState]:
-    """Return one state of each of a fleet's modules that sends states."""
+    """Return a state of each of these modules that sends one within `HEARD_S`."""
     states: dict[str, JointState] = {}
     with open_session(robot, "zero", fleet.run.path) as session:
         ends = {m: session.latest(topics.JOINT_STATE, JointState, m) for m in modules}
@@ -422,7 +424,7 @@ def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
     ik.q[:] = stand_pose(robot, height)
     kinematics.update(ik.q)
     p_ref = np.array([0.0, 0.0, kinematics.p[2], 0.0, 0.0, 0.0])
-    slope, before = 1.0, None  # d COM height / d torso height, by the last two rounds
+    slope, before = 1.0, None  # d COM height / d torso height, from the last two rounds
     for _ in range(ROUNDS):
         reach = ik.solve_from_anywhere(p_ref)
         if not reach.converged:

@@ -19,7 +19,7 @@ from tools.terminal import Console, marked
 from tools.topic_keys import keys_named
 
 BAG_RATE_HZ: Final = 100.0
-"""Rate of joint states, transforms and wrench in a bag."""
+"""Default rate of joint states, transforms and wrench in a bag."""
 
 
 EXAMPLES: Final = """

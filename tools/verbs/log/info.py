@@ -128,7 +128,9 @@ def _show_file(file: FileFacts, console: Console) -> None:
     flush_ms = file.metadata.get("recorder", {}).get("flush_ms", "")
     if not file.finished and not file.in_use:
         if flush_ms:
-            console.print(f"  written every {printable(flush_ms)} ms: later messages are missing")
+            console.print(
+                f"  written every {printable(flush_ms)} ms: messages after the last are lost"
+            )
         command = f"xrl log recover {printable(shlex.quote(str(file.path)))}"
         console.print(f"  finish it with: {command}", soft_wrap=True)
     elif lines and not file.in_use:

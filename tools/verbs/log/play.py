@@ -97,7 +97,7 @@ class _Port(Protocol):
     """Sender to one key of the bus."""
 
     def put(self, payload: bytes) -> bool:
-        """Send; False if it cannot be sent."""
+        """Send; return False if the message cannot be sent."""
 
 
 class Played(msgspec.Struct):
@@ -145,11 +145,11 @@ def pace(
 
     Args:
         entries: the messages.
-        ports: sender to each of their keys.
+        ports: sender for each key.
         rate: recorded seconds per second.
         played: counts to update.
         now_ns: monotonic clock.
-        sleep: waits, s.
+        sleep: waits for a time, s.
         heard: returns True if there is a subscriber.
         show: receives the position from time to time, ns.
     """

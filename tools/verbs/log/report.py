@@ -1,4 +1,4 @@
-"""`xrl log report`: writes a report of a run as one page for any browser, without a network."""
+"""`xrl log report`: writes a report of a run as one page that any browser shows offline."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ xrl log report out/a/run.mcap -o report.html --open no
 
 
 class ReportFlags(PartFlags):
-    """Run to report, and path of the page."""
+    """Run to report on, and path of the page."""
 
     file: Run
     out: Annotated[Path | None, option("-o", "--out", metavar="OUT")] = None

@@ -35,7 +35,7 @@ xrl log resim out/a/run.mcap
 xrl log resim out/a/run.mcap --service knee_left
 xrl log resim out/a/run.mcap --service planner --param law.K_p.x=2000
 xrl log resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
-xrl log resim out/a/run.mcap --tolerance 1e-9             # recorded on another machine class
+xrl log resim out/a/run.mcap --tolerance 1e-9             # recorded on another type of machine
 """
 
 
@@ -55,7 +55,7 @@ class ResimFlags(ControllerFlags, PartFlags):
     """change a key of the robot file, such as law.K_p.x=2000, and list the outputs that change
     most; repeatable"""
     tolerance: Annotated[float, Range(0.0, FINITE_MAX, ""), Arg(metavar="T")] = 0.0
-    """maximum accepted difference of numbers (default: 0, equal to the last bit)"""
+    """maximum accepted difference between numbers (default: 0, equal to the last bit)"""
     workers: Annotated[Count, Arg(metavar="N")] = dataclasses.field(default_factory=cores)
     """processes on this machine (default: one per core)"""
 

@@ -18,7 +18,7 @@ from tools.terminal import Console
 
 ABOUT: Final = """
 Record a minute with park off: stand, squat three times without a stop, and rest in a crouch. The
-robot file lab.toml reads the wearer file lab.wearer.toml beside it."""
+wearer file lab.wearer.toml is read with the robot file lab.toml beside it."""
 
 EXAMPLES: Final = """
 xrl log wearer out/anna/run.mcap

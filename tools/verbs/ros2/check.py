@@ -78,7 +78,7 @@ class _CheckRow(NamedTuple):
     what: str
     found: str
     fix: str = ""
-    """Remedy if it is not good."""
+    """Remedy if `good` is False."""
 
 
 def look(robot: RobotConfig, domain: int, wait_s: float) -> list[_CheckRow]:
@@ -128,7 +128,7 @@ def _opened(router: str, domain: int, types: RosTypes, wait_s: float) -> RosSess
 
 
 def _has_rate(topic: RosTopic, known: RosTopics, robot: RobotConfig) -> bool:
-    """Return True if the robot file enables a topic; the clock is optional."""
+    """Return True if a topic must be present: the robot file enables it; the clock is optional."""
     ros2 = robot.ros2
     rates = {
         known.joint_states: ros2.joint_states_hz, known.tf: ros2.tf_hz,
@@ -147,7 +147,7 @@ def _missing(topic: RosTopic, seen: list[SeenEndpoint]) -> _CheckRow:
 def _received(
     ros: RosSession, topics: list[RosTopic], known: RosTopics, wait_s: float
 ) -> list[_CheckRow]:
-    """Count what arrives, and wait up to `wait_s` for a slow topic's first message."""
+    """Count each topic's messages; wait up to `wait_s` for a slow topic's first message."""
     ros.subscribe(topics)
     counts = dict.fromkeys(topics, 0)
     joints: list[str] = []

@@ -170,7 +170,7 @@ function show(frame) {
   $("mode").textContent = planner ? planner.mode.toLowerCase() : "silent";
   $("planner").textContent = planner
     ? [planner.why, planner.wearer, planner.wait_s > 0 ? `leads again in ${planner.wait_s.toFixed(0)} s at the earliest` : "",
-      planner.heat_left_s >= 0 && planner.heat_left_s < 3600 ? `module too warm in ${planner.heat_left_s.toFixed(0)} s at this load` : "",
+      planner.heat_left_s >= 0 && planner.heat_left_s < 3600 ? `a module gets too warm in ${planner.heat_left_s.toFixed(0)} s at this load` : "",
       `tick ${planner.tick_us?.toFixed(0) ?? "-"} µs, assist ${planner.assist_n.toFixed(0)} N, carries ${planner.carried_n.toFixed(0)} N`]
       .filter(Boolean).join("; ")
     : "silent: each module holds on its own";

@@ -142,7 +142,7 @@ def test_all_that_differs_is_told_in_one_line() -> None:
 
 def test_kernel_and_number_of_processors_are_no_reason() -> None:
     found = likely_reason(origin(platform="Linux-6.18", cpu_count="64"), origin())
-    assert found == "no reason known: it was recorded with the same environment as here"
+    assert found == "no reason known: recorded in the same environment"
 
 
 def test_what_a_log_does_not_tell_is_not_taken_for_equal() -> None:

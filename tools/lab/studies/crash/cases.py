@@ -34,7 +34,7 @@ REQUEST_S: Final = 5.0
 BACK_S: Final = 5.2
 """Time at which that service, and every killed or stopped one, is restarted, s."""
 FAULT_LASTS_S: Final = 2.0
-"""Duration of a fault of a cable, supply or encoder, s; it ends before `REQUEST_S`."""
+"""Duration of the faults in `_LASTING`, s; they end before `REQUEST_S`."""
 DURATION_S: Final = 8.0
 
 HAND: Final = (
@@ -48,7 +48,7 @@ PUSHES: Final = (
 )
 
 CRASHED: Final = tuple(name for name in SERVICES if name not in ("simulator", *OPTIONAL))
-"""Services to kill; a robot has no simulator."""
+"""Services to kill; a robot has no simulator, and may have no IMU."""
 
 
 class CrashVerdict(StrEnum):
@@ -209,7 +209,7 @@ def _faulted(module: str, kind: FaultKind, *, quick: bool, sort: str) -> CrashCa
     """Return the case of one drive's fault."""
     name: str = kind
     expected = CrashVerdict.STOOD
-    # a knee moves on the way down, so its count jumps when the gap ends, which is an overspeed
+    # a knee moves on the way down, so its count jumps when the gap ends (OVERSPEED)
     hardly_moves = kind == "encoder_gap" and kind_of(module) != "knee"
     if hardly_moves:
         why = "the joint hardly moves in the gap, so the drive holds through it"

@@ -185,7 +185,7 @@ def measure(case: CrashCase, messages: CrashMessages, robot: RobotConfig) -> Cra
 
 
 def _crash_s(case: CrashCase, actions: Sequence[RunEvent]) -> float | None:
-    """Return the scenario time of the crash or of the triggered kill, s."""
+    """Return the scenario time of the crash, s; None if a triggered kill did not happen."""
     until_s = REQUEST_S - END_TOLERANCE_S
     kills = [row.scenario_s for row in actions if row.kind == RunEventKind.KILLED]
     kills = [at_s for at_s in kills if at_s < until_s]
@@ -198,7 +198,7 @@ def _crash_s(case: CrashCase, actions: Sequence[RunEvent]) -> float | None:
 def _safe_ms(
     case: CrashCase, events: Sequence[tuple[str, JointEvent]], crash_ns: int, request_ns: int
 ) -> float | None:
-    """Return the time until every module not hit has changed from TRACK to HOLD, ms."""
+    """Return the time until every module not hit is in HOLD, ms; None if one never was."""
     took = []
     for module in case.others:
         own = [event for name, event in events if name == module and event.t_ns < request_ns]

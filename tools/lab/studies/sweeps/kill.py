@@ -269,7 +269,7 @@ class _KillResult(Ended, frozen=True, kw_only=True):
     """Height of the torso at the kill."""
     kill_pitch_rad: float | None = None
     kill_margin: float | None = None
-    """Failsafe certificate of the last commands (docs/law.md#certificate)."""
+    """Margin of the last commands (docs/law.md#certificate)."""
     kill_margin_onboard: float | None = None
     holds_before: int = 0
     """Dropouts from TRACK of the module with the most, while the planner is alive."""

@@ -63,8 +63,8 @@ PUSH_SHARE: Final = (0.2, SHARE)
 PUSH_S: Final = 0.3
 PUSHES: Final = 3
 PUSHED_UNTIL_S: Final = 5.3
-"""Time at which the last push has ended, s. The pushes come over the bad network: one in each third
-of the time from the impairment until then, at a random moment."""
+"""Time at which the last push has ended, s. The pushes come while links are impaired: one in each
+third of the time from the impairment until then, at a random moment."""
 
 
 class _ControlKind(NamedTuple):

@@ -47,7 +47,7 @@ class _Ranges(Section, frozen=True):
 
 @cache
 def shipped() -> _Ranges:
-    """Return the ranges of this checkout.
+    """Return the shipped ranges.
 
     Raises:
         ConfigError: a range is invalid.
@@ -56,7 +56,9 @@ def shipped() -> _Ranges:
     for row in ranges.error:
         if not row.low < row.high or (row.scale == "log" and row.low <= 0.0):
             found = f"{row.low:g} to {row.high:g}"
-            raise ConfigError(str(RANGES_FILE), row.key, found, "low below high")
+            raise ConfigError(
+                str(RANGES_FILE), row.key, found, "low must be below high, above 0 on a log scale"
+            )
     return ranges
 
 

@@ -92,8 +92,8 @@ class _PushResult(msgspec.Struct, frozen=True, kw_only=True):
     fell_n: float | None
     """Smallest push that made it fall, within `STEP_N`, N; None if it withstood all of them."""
     held_limit_n: float
-    """Static limit of its gains (`tools.lab.design.push_limit`): those of HOLD, because a led robot
-    trips into it unless the push is straight forwards or back."""
+    """Static limit of the gains (`tools.lab.design.push_limit`): those of HOLD, because a led robot
+    trips into HOLD unless the push is straight forwards or back."""
     held_part: str
     """The part that sets this limit."""
     body_limit_n: float

@@ -1,4 +1,4 @@
-"""`xrl study robust`: leads, pushes and kills robots on random plants, and counts falls.
+"""`xrl study robust`: leads and pushes random plants, kills their planners, and counts falls.
 
 The seed and the number of a trial determine it.
 """
@@ -51,7 +51,7 @@ else:
 KINDS: Final = ("squat", "crawl", "lean")
 DELAY_MAX_MS: Final = 10.0
 LEAD_S: Final = 2.0
-"""Duration of each way of a squat, s; the crawl takes twice that."""
+"""Duration of each half of a squat, s; the crawl takes twice that."""
 LEAN_SHARE: Final = (0.15, 0.4)
 LEAN_S: Final = 1.5
 """Duration of the long push while the planner leads, s."""
@@ -239,14 +239,14 @@ def _excursion(row: Row) -> float:
 
 
 def report(finished: StudyRun) -> None:
-    """Print the outcome of the study, and the errors that cost most of the margin."""
+    """Print the outcome of the study, and the errors that cost the most margin."""
     rows = finished.rows
     study.show_outcome(finished, FIGURES, lambda row: f"{row['kind']}: trial {row['number']}")
     if len(rows) < RANKED_LEAST:
         most = f"unknown; ranking needs at least {RANKED_LEAST} trials"
     else:
         most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
-    finished.console.print(f"costs most of the margin (rank correlation): {most}", soft_wrap=True)
+    finished.console.print(f"costs the most margin (rank correlation): {most}", soft_wrap=True)
 
 
 def draw_excursions(finished: StudyRun) -> Picture:

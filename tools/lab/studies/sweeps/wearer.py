@@ -129,10 +129,10 @@ class _WearerResult(Ended, frozen=True, kw_only=True):
     """Largest vertical force of the hand, in a squat or after the act."""
     hand_n_park: float | None = None
     held: bool = False
-    """True if modules went to HOLD during the act."""
+    """True if a module went to HOLD during or after the act."""
     held_park: bool = False
     opened: float | None = None
-    """Fraction of the bumps that gave height and pitch back."""
+    """Fraction of the bumps that unparked the robot."""
 
 
 class WearerStudyFlags(StudyFlags):
@@ -257,7 +257,7 @@ def _report(finished: StudyRun) -> None:
         table.add_row("went to HOLD", *map(str, held), "")
         opened = [float(row["opened"]) for row in rows if row["opened"] is not None]
         if opened:
-            table.add_row("bumps that opened park", "-", f"{100 * np.mean(opened):.0f}", "%")
+            table.add_row("bumps that unparked", "-", f"{100 * np.mean(opened):.0f}", "%")
         finished.console.print(title, style="bold", highlight=False)
         finished.console.print(table)
 
