@@ -439,8 +439,9 @@ class DriveConfig(Section, frozen=True):
     encoder_period_ms: Annotated[int, Range(1, 100, "ms")]
     heartbeat_period_ms: Annotated[int, Range(1, 10_000, "ms")]
     zero_mark_turns: Annotated[float, Range(0.0, 4096.0, "turns")]
-    encoder_bandwidth: Annotated[float, Range(100.0, 8000.0, "rad/s")] = 2000.0
-    """Bandwidth of the drives' position and velocity estimates."""
+    encoder_bandwidth: Annotated[float, Range(100.0, 3999.0, "rad/s")] = 2000.0
+    """Bandwidth of the drives' position and velocity estimates; from 4000 rad/s on, firmware 0.5.6
+    disables the axis (UNSTABLE_GAIN)."""
 
     @property
     def lost_after_s(self) -> float:

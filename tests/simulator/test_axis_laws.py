@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from services.simulator.drives.axis_bank import AxisBank
 from services.simulator.drives.axis_encoders import PERIOD_S, OddEncoder, Words
-from services.simulator.drives.axis_faults import AxisErrors
+from services.simulator.drives.axis_faults import FAULTS, AxisErrors
 from shared.can.cansimple import (
     AxisError,
     AxisState,
@@ -27,6 +27,7 @@ from tests.simulator.banks import (
     DRIVE,
     DT,
     IDLE,
+    KT,
     ZERO,
     FirmwareAxis,
     close_loop,
@@ -156,6 +157,41 @@ def test_what_is_no_number_disarms_with_modulation_is_nan(mode: ControlMode, col
     assert bank.faults[1].motor == 0
     assert np.isfinite(torque).all(), "nothing reaches the shaft, in IDLE neither"
     assert np.isfinite(bank.step(bank.now_s + 1e-3, ZERO, ZERO)).all()
+
+
+@pytest.mark.parametrize(
+    ("limit", "torque", "disarms"),
+    [
+        (math.nan, 80.0 * KT, False),
+        (-1.0, 0.0, False),
+        (-20.0, 0.0, True),
+        (10.0, 10.0 * KT, False),
+    ],
+)
+def test_a_current_limit_of_nan_limits_nothing_and_a_negative_one_leaves_no_torque(
+    limit: float, torque: float, *, disarms: bool
+) -> None:
+    """Below the margin of -8 A even no current is too much (motor.cpp, 0.5.6)."""
+    bank = make_bank()
+    close_loop(bank, ControlMode.TORQUE, range(1))
+    bank.current_lim[0], bank.input_torque[0] = limit, 80.0 * KT
+    bank.step(bank.now_s + 1e-3, ZERO, ZERO)
+    assert bank.step(bank.now_s + 1e-3, ZERO, ZERO)[0] == pytest.approx(torque)
+    assert bank.faults[0] == (FAULTS["CURRENT_LIMIT"] if disarms else AxisErrors())
+
+
+@pytest.mark.parametrize(("limit", "trips"), [(12.5, False), (11.5, True)])
+def test_a_limit_that_is_lowered_below_the_flowing_current_less_its_margin_disarms(
+    limit: float, *, trips: bool
+) -> None:
+    bank = make_bank()
+    close_loop(bank, ControlMode.TORQUE, range(1))
+    bank.input_torque[0] = 20.0 * KT
+    for _ in range(50):
+        bank.step(bank.now_s + 1e-3, ZERO, ZERO)
+    bank.current_lim[0] = limit
+    bank.step(bank.now_s + 1e-3, ZERO, ZERO)
+    assert (bank.faults[0] == FAULTS["CURRENT_LIMIT"]) == trips
 
 
 AXIS = 5

@@ -139,6 +139,39 @@ def test_only_its_own_node_changes_a_drive_and_a_current_has_the_calibrated_sign
     assert cansimple.unpack_two_floats(old.ask(Command.GET_IQ)) == pytest.approx((-1.0, -1.0))
 
 
+def test_an_axis_that_was_armed_reports_a_requested_current_in_idle_too(old: Bench) -> None:
+    """The measured one stays as it was when the axis disarmed (can_simple.cpp, 0.5.6)."""
+    old.bank.input_torque[AXIS] = 0.0827
+    old.step()
+    assert cansimple.unpack_two_floats(old.ask(Command.GET_IQ)) == pytest.approx((1.0, 1.0))
+    old.bank.request_state(AXIS, AxisState.IDLE)
+    old.bank.input_torque[AXIS] = 2 * 0.0827
+    old.step()
+    assert not old.bank.torque.any()
+    assert cansimple.unpack_two_floats(old.ask(Command.GET_IQ)) == pytest.approx((2.0, 1.0))
+    old.bank.reboot(AXIS)
+    old.step(5.0)
+    assert old.ask(Command.GET_IQ) == bytes(8)
+
+
+def test_a_heartbeat_keeps_its_period(old: Bench) -> None:
+    count = 0
+    for _ in range(1000):
+        old.step(1e-3)
+        old.front.send_heartbeats(old.bank.now_s)
+        count += len(old.heard())
+    assert count == 20, "two axes, each every 100 ms"
+
+
+@pytest.mark.parametrize(("action", "limit"), [(0, 60.0), (1, 33.0)])
+def test_a_restart_of_0_6_saves_its_settings_first_if_asked(
+    new: Bench, action: int, limit: float
+) -> None:
+    new.bank.current_lim[AXIS] = 33.0
+    new.send(Command.REBOOT, bytes([action]))
+    assert new.bank.current_lim[AXIS] == limit
+
+
 # ---- dialects
 
 

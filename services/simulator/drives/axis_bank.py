@@ -36,6 +36,7 @@ from services.simulator.drives.axis_heat import AxisHeat, Heat
 from services.simulator.drives.axis_settings import configured
 from services.simulator.drives.axis_watches import Spinout, Watchdogs
 from services.simulator.drives.dc_bus import DEAD_VOLTAGE, DcBus
+from shared.bus.messages import Pair
 from shared.can.cansimple import (
     AxisError,
     AxisState,
@@ -109,7 +110,7 @@ class AxisBank:
         self.encoder_turns, self.connected = encoders.turns, control.connected
         self.encoder_mount = encoders.mount
         self.encoder_count, self.encoder_angle = encoders.counted, encoders.angle
-        self._shaft = np.zeros(n)
+        self._shaft, self._last_torque = np.zeros((2, n))
         self.now_s = -math.inf
         self.calibration = Calibration(self.settings, encoders, drive.torque_constant)
         self.heat = AxisHeat(self.settings, control, heat or Heat())
@@ -264,7 +265,7 @@ class AxisBank:
             self._spinout.armed(each)
             self.faults[each] = AxisErrors()
             self.input_pos[each] = self.input_vel[each] = self.input_torque[each] = 0.0
-            self._control.connected[each] = 0.0
+            self._control.connected[each] = self._last_torque[each] = 0.0
         self.settings.restore(drive)
         for each in _both(axis):
             self.calibration.restart(each)
@@ -287,6 +288,19 @@ class AxisBank:
             fault.controller != 0,
             trajectory_done=True,
         )
+
+    def currents(self, axis: int) -> Pair:
+        """Return the requested and the measured current that an axis reports, A.
+
+        Once an axis has been armed, its controller runs in IDLE too: the requested current still
+        changes, while the measured one keeps its last value (firmware 0.5.6).
+        """
+        requested = measured = float(self.torque[axis])
+        if not self._control.armed[axis] and axis not in self.calibration.running:
+            requested = float(self._control.results.asked[axis] * self.connected[axis])
+            measured = float(self._last_torque[axis])
+        of = self.settings.current
+        return of(axis, requested), of(axis, measured)
 
     # ---- faults and supply
 
@@ -401,6 +415,7 @@ class AxisBank:
         if self._control.armed[axis]:
             _, last = self.bus.powers(axis)
             self._spinout.disarmed(axis, self._control.asked_power(axis), last)
+            self._last_torque[axis] = self.torque[axis]
         self._control.armed[axis] = 0.0
         self.torque[axis] = 0.0
 

@@ -86,9 +86,11 @@ class _LawResults(NamedTuple):
     drives, the motor's true speed, and the filtered power of the torque that the controller
     requests, armed or not; A, A/s, A, turn/s, W."""
     broken: Vector
-    """1 if the torque is NaN, or the current limit NaN or negative."""
+    """1 if the torque is NaN."""
     extremes: Vector
     """(3,): number of axes beyond a limit, minimum and maximum power, W."""
+    asked: Vector
+    """Torque that the controller requests, armed or not."""
 
 
 class AxisControl:
@@ -204,7 +206,9 @@ def law_graph() -> ca.Function:
     step = ca.SX.sym("step", 2)
     dt_s, decay = step[0], step[1]
     vel, vel_limit = of["vel"], of["vel_limit"]
-    limit = of["current_lim"] * of["torque_constant"] * of["derating"]
+    # a NaN limit limits nothing and trips nothing (`std::clamp`, Motor::effective_current_lim)
+    current_lim = ca.if_else(of["current_lim"] < 0.0, 0.0, of["current_lim"])
+    limit = current_lim * of["torque_constant"] * of["derating"]
     position = of["control_mode"] >= ControlMode.POSITION
     regulates = of["control_mode"] >= ControlMode.VELOCITY
     torque = _clamp(of["input_torque"], -limit, limit)
@@ -226,7 +230,8 @@ def law_graph() -> ca.Function:
     most = of["vel_integrator_limit"]
     asked = _clamp(torque, -limit, limit)
     armed = of["armed"] > 0.0
-    broken = ca.logic_and(armed, ca.logic_not(ca.fabs(asked) <= limit))
+    is_number = ca.logic_or(asked <= 0.0, asked > 0.0)  # CasADi simplifies asked == asked
+    broken = ca.logic_and(armed, ca.logic_not(is_number))
     torque = ca.if_else(armed, asked, 0.0)
     tolerance = ca.if_else(of["enable_overspeed_error"] > 0.0, of["vel_limit_tolerance"], ca.inf)
     too_fast = (ca.fabs(vel) > vel_limit * tolerance) * of["connected"]
@@ -247,7 +252,7 @@ def law_graph() -> ca.Function:
             ca.densify(one)
             for one in (
                 torque, _clamp(integrator, -most, most), too_fast, power, mechanical, over_current,
-                loops_next, broken, extremes,
+                loops_next, broken, extremes, asked,
             )
         ],
         {"cse": True},
@@ -260,15 +265,15 @@ def _currents(
     """Return the current loops after the step, and the axes beyond the limit plus its margin.
 
     The EMF's rate x1 and the current x2 that it drives follow x1' = z - R / L x1, x2' = x1 - w x2
-    with z = e' / L, for a speed that ramps over the step. A lowered limit acts a cycle later.
+    with z = e' / L, for a speed that ramps over the step. A lowered limit is compared with the
+    current that still flows.
     """
     current, x1, x2, speed_before, _ = ca.vertsplit(loops, N_JOINTS)
     w, kt, resistance = (
         of[name] for name in ("current_control_bandwidth", "torque_constant", "phase_resistance")
     )
     wanted = torque / kt
-    first = wanted + (current - wanted) * ca.exp(-w / FIRMWARE_RATE_HZ)
-    current = wanted + (current - wanted) * ca.exp(-w * dt_s)
+    before, current = current, wanted + (current - wanted) * ca.exp(-w * dt_s)
     rate = ca.if_else(dt_s > 0.0, (speed - speed_before) / dt_s, 0.0)
     z = -2.0 / 3.0 * kt * 2.0 * math.pi * rate / PHASE_INDUCTANCE
     # the winding's pole must differ from the loop's, because the formula divides by the difference
@@ -281,7 +286,7 @@ def _currents(
     x2_next = x2 * fade_2 + rest * (1.0 - fade_2) / w
     x2_next += (x1 - rest) * (fade_1 - fade_2) / (w - pole)
     limit = of["current_lim"] * of["derating"] + of["current_lim_margin"]
-    most = ca.fmax(ca.fabs(first), ca.fabs(current + x2_next))
+    most = ca.fmax(ca.fabs(before), ca.fabs(current + x2_next))
     over = ca.logic_and(of["armed"] > 0.0, most > limit)
     kept = ca.if_else(of["armed"] > 0.0, 1.0, 0.0)
     return ca.vertcat(current * kept, x1_next * kept, x2_next * kept, speed), over

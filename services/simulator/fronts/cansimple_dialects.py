@@ -97,6 +97,7 @@ GPIOS: Final = 9
 ANALOG_GPIOS: Final = range(1, 6)
 
 _READINGS: Final = ("vbus_voltage", "ibus")
+_SAVE: Final = 1  # action of 0.6's reboot frame: save the settings, then restart
 
 
 class Dialect(NamedTuple):
@@ -210,6 +211,13 @@ def _set_absolute_position(bank: AxisBank, axis: int, data: bytes) -> None:
         bank.set_count(axis, turns * bank.settings.axis("encoder.config.cpr")[axis])
 
 
+def _reboot(bank: AxisBank, axis: int, data: bytes) -> None:
+    """Restart the drive; with action 1, save its settings first (2, erase, is not emulated)."""
+    if data[0] == _SAVE:
+        bank.settings.save(axis >> 1)
+    bank.reboot(axis)
+
+
 def _full(name: str, axis: int) -> str:
     return name if name in DRIVE_SETTINGS else f"axis{axis & 1}.{name}"
 
@@ -221,7 +229,7 @@ def _sdo_layout(value: Value) -> str:
 
 
 _BOTH: Final[Mapping[int, Answer]] = {
-    Command.GET_IQ: lambda bank, axis: _twice(bank.settings.current(axis, bank.torque[axis])),
+    Command.GET_IQ: lambda bank, axis: cansimple.pack_two_floats(*bank.currents(axis)),
     Command.GET_VBUS: lambda bank, axis: cansimple.pack_two_floats(*bank.bus.state(axis >> 1)),
 }
 _ANSWERS_05: Final[Mapping[int, Answer]] = {
@@ -262,6 +270,9 @@ DIALECTS: Final[Mapping[DialectName, Dialect]] = {
         answers={**_BOTH, **_ANSWERS_06},
         asked={},
         sdo=_sdo,
-        setters={Command06.SET_ABSOLUTE_POSITION: _set_absolute_position},
+        setters={
+            Command.REBOOT: _reboot,
+            Command06.SET_ABSOLUTE_POSITION: _set_absolute_position,
+        },
     ),
 }

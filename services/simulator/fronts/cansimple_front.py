@@ -116,23 +116,24 @@ class CanSimpleFront:
 
     def send_heartbeats(self, now_s: float) -> None:
         """Send the heartbeat of each axis whose period has passed by `now_s`."""
-        if now_s < self._heartbeat_from_s:
+        if now_s < self._heartbeat_from_s - _EARLY_S:
             return
         bank, due_s = self._bank, self._next_heartbeat_s
         self._read_periods()
         for bus in self._buses:
             frames = []
             for node, axis in bus.nodes.items():
-                if now_s >= due_s[axis]:
-                    due_s[axis] = max(due_s[axis], now_s) + self._heartbeat_periods_s[axis]
+                due = due_s[axis]
+                if now_s >= due - _EARLY_S:
+                    due_s[axis] = max(due, now_s - _EARLY_S) + self._heartbeat_periods_s[axis]
                     if bank.is_responding(axis):
                         self._count(axis, now_s)
                         can_id = cansimple.arbitration_id(node, Command.HEARTBEAT)
                         frames.append((can_id, self._dialect.heartbeat(bank, axis)))
             if frames:
                 bus.hub.broadcast(frames)
-        due = (due_s[axis] for bus in self._buses for axis in bus.axes)
-        self._heartbeat_from_s = min(due, default=math.inf)
+        dues = (due_s[axis] for bus in self._buses for axis in bus.axes)
+        self._heartbeat_from_s = min(dues, default=math.inf)
 
     def _count(self, axis: int, now_s: float) -> None:
         """Count the mailboxes that a heartbeat, and an encoder frame sent with it, occupy."""

@@ -165,8 +165,12 @@ def _axis(i: int) -> list[Property | Function]:
         shown(
             "motor.motor_thermistor.temperature", "float", lambda bank, axis: bank.heat.motor[axis]
         ),
-        shown("motor.current_control.Iq_setpoint", "float", _current),
-        shown("motor.current_control.Iq_measured", "float", _current),
+        shown(
+            "motor.current_control.Iq_setpoint", "float", lambda bank, axis: bank.currents(axis)[0]
+        ),
+        shown(
+            "motor.current_control.Iq_measured", "float", lambda bank, axis: bank.currents(axis)[1]
+        ),
         fault("encoder.error", "uint16", "encoder"),
         shown("encoder.is_ready", "bool", lambda bank, axis: bank.calibration.encoder[axis]),
         shown("encoder.shadow_count", "int32", lambda bank, axis: bank.encoder_count(axis)),
@@ -202,10 +206,6 @@ def _set_odrive_error(board: EmulatedBoard, value: Value) -> None:
 
 def _is_armed(bank: AxisBank, axis: int) -> bool:
     return bank.state[axis] not in (AxisState.IDLE, AxisState.UNDEFINED)
-
-
-def _current(bank: AxisBank, axis: int) -> float:
-    return bank.settings.current(axis, bank.torque[axis])
 
 
 def _input(name: str, i: int) -> Property:
