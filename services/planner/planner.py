@@ -550,7 +550,7 @@ class Planner:
             margin_onboard=margin_onboard,
             split=int(output.local.source) if output is not None else int(SplitSource.DIAGONAL),
             ik_iterations=output.ik_iterations if output is not None else 0,
-            ik_residual=output.ik_residual if output is not None else 0.0,
+            ik_residual=round(output.ik_residual, 9) if output is not None else 0.0,
             tick_us=tick_us,
             state_seq=(seqs[0], seqs[1], seqs[2], seqs[3], seqs[4], seqs[5]),
             wrench_seq=-1 if s.wrench is None else s.wrench.seq,

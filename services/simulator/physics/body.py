@@ -41,6 +41,9 @@ position.
 
 ITERATIONS: Final = 8
 """Newton steps from `stand_pose` until the soles are flat to rounding errors."""
+_PRESSED: Final = 1e-9
+"""Depth of the soles in the floor at the start, m. At 0 the last bit would decide which of their
+corners touch: four of eight on x86-64, all on Arm."""
 
 
 class Body(NamedTuple):
@@ -216,6 +219,8 @@ class FootPlacement:
             com = data.subtree_com[0]  # the COM moves less than the torso
             data.qpos[:2] += level + np.array(lean) * com[2] - com[:2]
             self._flatten_soles()
+        data.qpos[2] -= _PRESSED
+        mujoco.mj_forward(model, data)
 
     def stand_at(self, q: Array) -> None:
         """Place the robot at rest at joint angles (12,), rad, as `World.stand_at` describes."""

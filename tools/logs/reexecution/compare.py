@@ -234,8 +234,10 @@ def likely_reason(recorded: Origin, here: Origin) -> str:
             differing.append(f"{name} {one}, here {other}")
     if differing:
         line = f"likely reason: recorded with {'; '.join(differing)}"
+        if not all(each.startswith("code ") for each in differing):
+            line += "; `--tolerance 2e-6` accepts what another machine rounds differently"
     else:
-        line = "no reason known: recorded in the same environment"
+        line = f"no reason known: {'no known fact differs' if untold else 'the same environment'}"
     return f"{line} (unknown: {', '.join(untold)})" if untold else line
 
 
