@@ -93,7 +93,7 @@ def freeze(setpoint: Setpoint, moving_share: float) -> Setpoint:
 
 
 def raise_gains(setpoint: Setpoint, k_p: Pair, k_d: Pair, share: float) -> Setpoint:
-    """Return a setpoint with lower gains raised towards k_p and k_d by `share` of the gap.
+    """Return a setpoint whose lower gains have risen towards k_p and k_d by `share` of the gap.
 
     `share` is 0 .. 1. Gains never fall, because a larger D only adds stiffness.
     """

@@ -83,7 +83,7 @@ class _RecoveryResult(msgspec.Struct, frozen=True, kw_only=True):
     counted: int | None
     """Messages that the original's summary counts; None if that is missing or damaged."""
     earlier_ends: int
-    """Ends in the middle of the original; left out."""
+    """Number of file ends found in the middle of the original; left out."""
     cut: LostBytes | None
     damage: tuple[LostBytes, ...]
 

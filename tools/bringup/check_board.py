@@ -317,7 +317,7 @@ def _supply_rows(boards: Boards) -> list[Finding]:
     usual = median(volts.values()) if volts else 0.0
     fix = "check this board's fuse, plug and wires: all boards share one supply"
     return [
-        warning(module, "supply", f"{value:.1f} V", f"about {usual:.1f} V, as the others", fix)
+        warning(module, "supply", f"{value:.1f} V", f"about {usual:.1f} V, like the others", fix)
         for module, value in volts.items()
         if abs(value - usual) > VOLTS_APART
     ]

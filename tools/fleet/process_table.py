@@ -232,7 +232,7 @@ def load_table(path: Path = TABLE) -> _ProcessTable:
     for name in names:
         if names.count(name) > 1:
             right = "must be listed once"
-            raise ConfigError(str(path), "process", f"{name!r} is in it twice", right)
+            raise ConfigError(str(path), "process", f"{name!r} is listed twice", right)
     return msgspec.structs.replace(table, process=tuple(rows))
 
 

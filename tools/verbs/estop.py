@@ -58,7 +58,7 @@ class EstopFlags(Flags):
     """with --local: modules of this host that must stop (default: all six)"""
     wait: bool = False
     """connect now, report silent modules, and stop on Enter, Ctrl-C or a closed terminal;
-    typing q and Enter quits without a stop"""
+    typing q, then Enter, quits without a stop"""
     config: Annotated[
         Path | None,
         Arg(help=f"robot file (default: the fleet's, else {ROBOT_FILE} in the working directory)"),
@@ -131,7 +131,9 @@ def _wait(robot: RobotConfig, run_dir: Path, *, here: bool) -> int:
     console, asked = Console(), StopFlag(signal.SIGHUP)
     with open_session(robot, "estop", run_dir) as session:
         stop = BusStop(robot, session, run_dir if here else None)
-        console.print("Enter, Ctrl-C or closing this terminal stops all modules; q and Enter quits")
+        console.print(
+            "Enter, Ctrl-C or closing this terminal stops all modules; q, then Enter, quits"
+        )
         told: list[str] | None = None
         since_s = time.monotonic()
         typed = None
@@ -189,7 +191,9 @@ def pendant(flags: PendantFlags) -> int:
     elsewhere = [module for module in MODULES if module not in handle.modules]
     if elsewhere:
         console.print(f"this pendant does not stop {', '.join(elsewhere)}: no service on this host")
-    console.print("held: Enter lays it down; Ctrl-C or the end of this program stops all modules")
+    console.print(
+        "held: Enter lays it down; Ctrl-C or a crash of this program stops this host's modules"
+    )
     ends = None if flags.for_s is None else time.monotonic() + flags.for_s
     shown = None
     while not stop and shown != "":

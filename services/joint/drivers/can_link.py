@@ -350,7 +350,7 @@ def receiver(bus: can.BusABC, *, in_kernel: bool) -> Receive:
     """Return a function that waits once on a bus, then receives all available frames.
 
     A kernel bus is read at its socket, because python-can creates an object for each frame, and
-    waits by the wall clock. If NTP sets that clock back, a silent bus would block the loop.
+    waits by the wall clock. If NTP set that clock back, a silent bus would block the loop.
     """
     if isinstance(bus, UnixCanBus):
         return bus.recv_packet

@@ -137,7 +137,7 @@ def test_a_service_that_this_fleet_does_not_have_is_refused(
         ),
         ('"{run}"', '"{module}"', "process[0].command", "{module} is not a placeholder here"),
         ('name = "simulator"', 'name = "{simulator}"', "process[0].name", "one of {module}"),
-        ('name = "harness"', 'name = "knee_left"', "process", "'knee_left' is in it twice"),
+        ('name = "harness"', 'name = "knee_left"', "process", "'knee_left' is listed twice"),
     ],
 )
 def test_a_bad_row_is_refused_with_its_key(

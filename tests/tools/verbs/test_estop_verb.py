@@ -99,7 +99,7 @@ def test_one_that_waits_stops_when_its_terminal_goes(
     ) as waiting:
         os.close(terminal)
         told = b""
-        while b"q and Enter quits" not in told:
+        while b"q, then Enter, quits" not in told:
             told += os.read(person, 1000)
         if how == "a hang-up":
             waiting.send_signal(signal.SIGHUP)

@@ -83,7 +83,7 @@ REFUSALS: Final = {
     "drive zero --at 0,0": "one of the arguments MODULE --all is required",
     "drive tare": "no fleet is up in",
     "drive jog elbow": "invalid choice: 'elbow' (choose from 'ankle_right'",
-    "drive jog knee_left --by 0": "--by 0: moves nothing; give up to 0.5 rad either way",
+    "drive jog knee_left --by 0": "--by 0: moves nothing; use at most 0.5 rad either way",
     "drive jog knee_left --by -0.51": "a number from -0.5 to 0.5 rad",
     "drive jog knee_left --period 0.4": "a number from 0.5 to 60 s",
     "drive jog knee_left --cycles 101": "a whole number from 1 to 100",

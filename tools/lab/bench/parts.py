@@ -281,7 +281,7 @@ FIGURES: Final = (
 
 
 class Bench:
-    """The parts of a robot, prepared once for all turns."""
+    """The timed parts of the fleet, prepared once for all turns."""
 
     def __init__(self, robot: RobotConfig, squat: Scenario, stack: ExitStack) -> None:
         """Run a squat in virtual time and prepare every part with its inputs."""

@@ -73,7 +73,7 @@ class JogFlags(MotionFlags):
         """Refuse a motion of zero."""
         super().check()
         if self.by == 0.0:
-            raise DriveError(f"--by 0: moves nothing; give up to {BY_MAX:g} rad either way")
+            raise DriveError(f"--by 0: moves nothing; use at most {BY_MAX:g} rad either way")
 
     @property
     def plan(self) -> JogPlan:
@@ -96,7 +96,7 @@ def run(flags: JogFlags) -> int:
     def introduce(_q: Mapping[str, Pair]) -> JogPlan:
         by, period_s, cycles = plan.course
         console.print(
-            f"{module} {flags.axis}: {by:+g} rad and back, {cycles} times in {period_s:g} s each, "
+            f"{module} {flags.axis}: {by:+g} rad and back, {cycles} times, {period_s:g} s each, "
             f"with at most {plan.torque_limit:g} N m "
             f"({limited.drive.current_lim:.1f} A per motor, {limited.drive.vel_limit:.1f} turn/s)"
         )

@@ -259,7 +259,7 @@ class _Zeroing(NamedTuple):
         return seen
 
     def _set(self, wanted: Mapping[str, Pair]) -> list[str]:
-        """Write and read back all positions, and print them; return those read back correctly."""
+        """Write all positions, read them back and print both; return the modules that have them."""
         table, done = _table("written, rad", "read back, rad", ""), []
         for module, q in wanted.items():
             try:
@@ -438,4 +438,4 @@ def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
             slope = (z_com - before[1]) / (z - before[0])
         before = (z, z_com)
         p_ref[2] += slope * (height - z)
-    raise RunError(f"--standing {height:g}: no stand found at this height; measure it again")
+    raise RunError(f"--standing {height:g}: no pose stands with its hips there; measure it again")

@@ -97,9 +97,9 @@ def run_fleet(
 ) -> CaseRun:
     """Run a case in virtual time to its end or to the fall.
 
-    Rows count from the scenario time `from_s`. The network applies to every link, in addition to
-    the scenario's own impairments. Messages of the types `kept` are returned. `each` receives every
-    row before the observer.
+    Rows before the scenario time `from_s` are dropped, except that of a fall. The network applies
+    to every link, in addition to the scenario's own impairments. Messages of the types `kept` are
+    returned. `each` receives every row before the observer.
     """
     messages: list[tuple[str, Message]] = []
 

@@ -239,14 +239,14 @@ def _excursion(row: Row) -> float:
 
 
 def report(finished: StudyRun) -> None:
-    """Print the outcome of the study, and the errors that cost the most margin."""
+    """Print the outcome of the study, and the errors that move the COM most."""
     rows = finished.rows
     study.show_outcome(finished, FIGURES, lambda row: f"{row['kind']}: trial {row['number']}")
     if len(rows) < RANKED_LEAST:
         most = f"unknown; ranking needs at least {RANKED_LEAST} trials"
     else:
         most = ", ".join(f"{key} {value:+.2f}" for key, value in ranking(rows)[:5])
-    finished.console.print(f"costs the most margin (rank correlation): {most}", soft_wrap=True)
+    finished.console.print(f"rank correlation with the COM's excursion: {most}", soft_wrap=True)
 
 
 def draw_excursions(finished: StudyRun) -> Picture:
