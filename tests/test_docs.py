@@ -146,7 +146,7 @@ def test_the_table_of_processes_has_every_topic_that_a_service_writes() -> None:
         ("logs.md", f"| below {host_watch.WARN:g} | warns in its log; warns again only"),
         ("logs.md", f"again only after at least {host_watch.CALM:g} were free"),
         ("logs.md", f"| back to {host_watch.RESUME:g} or more |"),
-        ("logs.md", f"the same factors of {host_watch.RUN_DIR_MIN_MIB} MiB"),
+        ("logs.md", f"the same multiples of {host_watch.RUN_DIR_MIN_MIB} MiB"),
         ("law.md", f"down to {CERTIFICATE.margin_min:g} (`certificate.margin_min`)"),
         (
             "law.md",

@@ -55,7 +55,7 @@ def test_none_is_rearmed_while_it_moves_or_is_pulled_or_one_is_missing() -> None
     assert "no service of hip_left" in hindrance(six, [], HERE - {"hip_left"}, planner=True)
     assert "150 N on the harness" in hindrance(six, [], HERE, 150.0, planner=True)
     assert hindrance(six, [], HERE, 39.0, planner=True) == ""
-    assert "no planner" in hindrance(six, [], HERE, planner=False)
+    assert "needs a planner" in hindrance(six, [], HERE, planner=False)
     assert "no module is in DAMP" in hindrance(tracking, [], HERE, planner=True)
 
 
