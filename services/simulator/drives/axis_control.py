@@ -237,7 +237,8 @@ def law_graph() -> ca.Function:
     too_fast = (ca.fabs(vel) > vel_limit * tolerance) * of["connected"]
     mechanical = 2.0 * math.pi * vel * torque
     copper = 1.5 * of["phase_resistance"] * of["warmth"] / of["torque_constant"] ** 2
-    power = copper * torque * torque + mechanical
+    # never -0.0: of two zeros, C and CasADi may take either as the smaller
+    power = ca.if_else(torque == 0.0, 0.0, copper * torque * torque + mechanical)
     loops_next, over_current = _currents(of, torque, loops, speed, dt_s)
     asked_power = loops[_POWER:]
     gain = (2.0 * math.pi * vel * asked - asked_power) * (1.0 - ca.exp(-BANDWIDTH * dt_s))
