@@ -202,7 +202,7 @@ def test_a_person_who_pulls_harder_at_rest_than_they_lead_is_told_so() -> None:
     log = MadeLog(lambda t: 24.0 if t > 14.0 else 12.0, minute, span_s=MINUTE_S)
     found = thresholds_of(cast(RunLog, log), ROBOT)
     assert found.thresholds.open_n == pytest.approx(IDLE_MARGIN * 24.0, abs=0.5)
-    assert "open on its own" in found.doubts[0]
+    assert "unpark on its own" in found.doubts[0]
 
 
 def test_without_squats_and_a_rest_nothing_is_measured() -> None:

@@ -250,7 +250,7 @@ KEPT: dict[str, Value] = {"axis0.encoder.config.phase_offset": 4021}
         ),
         (
             Identity("3A0000000005", {"axis0.encoder.config.phase_offset": 3977}),
-            "calibrated since.*phase_offset is 3977, but was 4021",
+            "calibrated after it was zeroed.*phase_offset is 3977, but was 4021",
         ),
     ],
 )
