@@ -74,7 +74,7 @@ def test_with_planner_and_bus_dead_it_sinks_by_shared_memory(ear: FleetEar, run_
     ear.wait_for(Mode.HOLD)
     done = xrl("estop", "--local", run_dir=run_dir)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "all six modules are stopped" in done.stdout
+    assert "stopped (DAMP): all six modules" in done.stdout
     assert {Neighbours.mode_of(run_dir, module) for module in MODULES} == {Mode.DAMP}
     ear.wait_for(Mode.DAMP)
     assert all("xrl estop by" in stop_source(run_dir, module) for module in MODULES)

@@ -62,7 +62,7 @@ def test_of_several_hosts_one_answers_for_its_own_modules(
 ) -> None:
     words = ["estop", "--local", "--run-dir", run_dir, "--partly", "knee_left,hip_left"]
     assert exit_code(words) == 0
-    assert "knee_left, hip_left are stopped" in capsys.readouterr().out
+    assert "stopped (DAMP): knee_left, hip_left" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("partly", [["--partly", "knee_left,hip_left"], []], ids=["partly", "all"])
