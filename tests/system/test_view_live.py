@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import subprocess
@@ -95,8 +96,13 @@ def test_a_page_leads_pushes_freezes_and_kills_and_the_log_has_it_all(tmp_path: 
         try:
             assert process.stdout is not None
             lines = iter(process.stdout.readline, "")
-            address = next(line.split()[0] for line in lines if line.startswith("http://"))
-            asyncio.run(lead(address))
+            for address in (line.split()[0] for line in lines if line.startswith("http://")):
+                # where the cores are full it starts again, slower, with a page of its own
+                with contextlib.suppress(aiohttp.WSMessageTypeError):
+                    asyncio.run(lead(address))
+                    break
+            else:
+                pytest.fail("it ended before the page had done all")
             os.kill(process.pid, signal.SIGINT)
             said, _ = process.communicate(timeout=90)
         finally:
