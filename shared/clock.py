@@ -24,9 +24,12 @@ _pace = 1.0
 
 
 def now_ns() -> int:
-    """Return the fleet's time in ns: one clock for all processes of one host."""
+    """Return the fleet's time in ns: one clock for all processes of one host.
+
+    It counts whole microseconds, because stamps with random nanoseconds take a third more of a log.
+    """
     now = time.monotonic_ns()
-    return now if _pace == 1.0 else int(now * _pace)
+    return (now if _pace == 1.0 else int(now * _pace)) // NS_PER_US * NS_PER_US
 
 
 def sleep_until(deadline_ns: int) -> None:

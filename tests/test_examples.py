@@ -43,7 +43,7 @@ def test_the_drive_of_its_own_holds_its_target_under_load() -> None:
 def test_one_module_holds_and_gives_back_what_the_load_takes() -> None:
     lines = lines_of("hold_one_module.py")
     assert all("HOLD" in line for line in lines)
-    assert "torque  -20.00" in lines[2]
+    assert "torque  -20.0" in lines[2]
     assert "theta  -1.0000" in lines[-1]
 
 

@@ -15,7 +15,7 @@ from shared.bus.messages import Tare, TareRequest, Vector6, Wrench
 from shared.bus.ports import Inbox, Outbox
 from shared.can.sensor_loop import Sensor, SensorLoop
 from shared.robot.stewart import N_LEGS
-from shared.rounding import DECIMALS
+from shared.rounding import FORCE
 from shared.run_directory import live_dir, mapped
 
 
@@ -53,7 +53,7 @@ class HarnessLoop(SensorLoop[Vector6, Wrench]):
         if self._zero is not None and done is not self._kept:
             self._kept = done
             self._zero.write(self.state.offset if done else None)
-        fx, fy, fz, mx, my, mz = reading.wrench.round(DECIMALS).tolist()
+        fx, fy, fz, mx, my, mz = reading.wrench.round(FORCE).tolist()
         return Wrench(
             t_ns=now_ns,
             seq=self.cycles,

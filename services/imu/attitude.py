@@ -19,7 +19,7 @@ from shared.can.sensor_frames import ImuSample
 from shared.clock import NS_PER_MS
 from shared.config.sections import ImuConfig
 from shared.robot.frames import rotated, torso_rotation
-from shared.rounding import DECIMALS
+from shared.rounding import POSITION, RATE
 
 UNIT_TOLERANCE: Final = 0.02
 """Maximum deviation of a quaternion's length from 1; rounding to 2^-15 causes 6e-5."""
@@ -70,8 +70,10 @@ class AttitudeLaw:
                 self._newest, self._changed_ns = sample, now_ns
             self._knows = sample.valid
             if sample.valid:
-                self._up = _rounded(rotated(self._mounting, up_in_sensor(sample.quaternion)))
-                self._rate = _rounded(rotated(self._mounting, sample.rate))
+                self._up = _rounded(
+                    rotated(self._mounting, up_in_sensor(sample.quaternion)), POSITION
+                )
+                self._rate = _rounded(rotated(self._mounting, sample.rate), RATE)
         if self._sample_ns is None:
             return AttitudeReading(self._up, self._rate, valid=False, age_ns=-1)
         age_ns = now_ns - self._sample_ns
@@ -88,9 +90,9 @@ def up_in_sensor(quaternion: Vector4) -> Vector3:
     return (up[0] / length, up[1] / length, up[2] / length)
 
 
-def _rounded(vector: Vector3) -> Vector3:
+def _rounded(vector: Vector3, decimals: int) -> Vector3:
     x, y, z = vector
-    return round(x, DECIMALS), round(y, DECIMALS), round(z, DECIMALS)
+    return round(x, decimals), round(y, decimals), round(z, decimals)
 
 
 def _is_unit(quaternion: Vector4) -> bool:

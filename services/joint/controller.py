@@ -30,7 +30,7 @@ from services.joint.trips import limits_of as trip_limits_of
 from shared.bus.messages import Cause, JointCommand, JointEvent, JointState, Mode, Outside, Pair
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
-from shared.rounding import rounded
+from shared.rounding import FORCE, rounded
 
 # Compared in each cycle: docs/contributing.md, The control path.
 _DISARMED, _TRACK, _FAULT = Mode.DISARMED, Mode.TRACK, Mode.FAULT
@@ -142,7 +142,7 @@ class JointController:
         if mode is _DISARMED or mode is _FAULT:
             s.tau = pd_law.ZERO
         else:
-            wanted = rounded(self._wanted(s, now_ns, setpoint))
+            wanted = rounded(self._wanted(s, now_ns, setpoint), FORCE)
             s.tau = limit_torque(wanted, s.estimate.q, tau_before, self._limits)
         if self.heat.enabled:
             self._warm(s, now_ns, reading)

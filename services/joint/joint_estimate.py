@@ -25,7 +25,7 @@ from services.joint.turn_watch import UNKNOWN, TurnWatch
 from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_S
-from shared.rounding import rounded
+from shared.rounding import POSITION, RATE, rounded
 
 JUMP_TURNS: Final = 0.1
 """Largest jump of a motor beyond the motion at its last velocity, turns: 0.02 rad at the joint."""
@@ -134,8 +134,8 @@ class JointEstimate(msgspec.Struct):
             return event
         self.rejected_count = 0
         self.pos, self.vel, self.accepted_ns = reading.pos_turns, reading.vel_turns, self.t_ns
-        self.q = rounded(joint_from_motor(reading.pos_turns, self.gear_ratio))
-        self.v = rounded(joint_from_motor(reading.vel_turns, self.gear_ratio))
+        self.q = rounded(joint_from_motor(reading.pos_turns, self.gear_ratio), POSITION)
+        self.v = rounded(joint_from_motor(reading.vel_turns, self.gear_ratio), RATE)
         return event
 
     def _is_plausible(self, reading: DriveReading, tau: Pair, *, armed: bool) -> bool:

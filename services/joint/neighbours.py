@@ -35,7 +35,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import LOST_S
 from shared.joints import MODULE_INDEX, MODULES, N_MODULES, kind_of
 from shared.robot.hold_rules import SUPPORT_FOR
-from shared.rounding import rounded
+from shared.rounding import POSITION, rounded
 from shared.run_directory import live_dir, mapped
 
 STALE_NS: Final = 20 * NS_PER_MS
@@ -115,7 +115,7 @@ def view_of(module: str, rows: Sequence[NeighbourRow | None], now_ns: int) -> Ne
     if kind == "hip":
         ankle, knee = _fresh(rows[own - 2], now_ns), _fresh(rows[own - 1], now_ns)
         if ankle is not None and knee is not None:
-            leg = rounded((ankle.theta + knee.theta, ankle.rate + knee.rate))
+            leg = rounded((ankle.theta + knee.theta, ankle.rate + knee.rate), POSITION)
     elif kind == "ankle":
         knee = _fresh(rows[own + 1], now_ns)
         if knee is not None:

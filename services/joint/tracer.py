@@ -13,7 +13,7 @@ import msgspec
 from services.joint.drive_manager import DriveAction, DriveManager
 from services.joint.drivers.base import DriveReading
 from services.joint.neighbours import UNKNOWN, NeighbourView
-from shared.bus.messages import JointCommand, Pair
+from shared.bus.messages import JointCommand
 from shared.bus.traces import CycleTrace, JointTrace
 
 CYCLES: Final = 10
@@ -26,7 +26,7 @@ _UNTOLD: Final = (-1.0, -1.0)
 
 
 _Cycle = tuple[
-    int, DriveReading | None, JointCommand | None, bool, DriveAction, NeighbourView, int, int, Pair
+    int, DriveReading | None, JointCommand | None, bool, DriveAction, NeighbourView, int, int
 ]
 """A cycle's raw inputs and outcome. Converting ten at once is cheaper than converting one per cycle
 with cold caches."""
@@ -55,8 +55,7 @@ class Tracer:
         ended: int = 0,
     ) -> JointTrace | None:
         """Record a cycle; return a message once it has `CYCLES`."""
-        tau = self._module.state.controller.tau
-        self._cycles.append((now_ns, reading, command, estop, step, near, malformed, ended, tau))
+        self._cycles.append((now_ns, reading, command, estop, step, near, malformed, ended))
         return self.take() if len(self._cycles) == CYCLES else None
 
     def take(self) -> JointTrace | None:
@@ -64,12 +63,8 @@ class Tracer:
         if not self._cycles:
             return None
         self._seq += 1
-        trace = JointTrace(
-            t_ns=self._cycles[-1][0],
-            seq=self._seq,
-            snapshot=self._snapshot,
-            cycles=tuple(_trace_of(*cycle) for cycle in self._cycles),
-        )
+        cycles = [_trace_of(*cycle) for cycle in self._cycles]
+        trace = JointTrace.of(cycles, self._seq, self._snapshot)
         self._cycles.clear()
         self._remember()
         return trace
@@ -89,7 +84,6 @@ def _trace_of(
     near: NeighbourView,
     malformed: int,
     ended: int,
-    tau: Pair,
 ) -> CycleTrace:
     torque = None if r is None else r.torque
     return CycleTrace(
@@ -105,7 +99,6 @@ def _trace_of(
         -1 if command is None else command.seq,
         estop,
         step.command.value,
-        tau,
         near.leg or _NOTHING,
         near.leg is not None,
         near.sinks,

@@ -174,9 +174,10 @@ class PlannerLoop:
         if attitude is not None:
             planner.receive_attitude(attitude, now)
         planner.receive_request(ports.request(now))
-        for publisher, command in zip(ports.commands, planner.tick(now), strict=False):
+        commands = planner.tick(now)
+        for publisher, command in zip(ports.commands, commands, strict=False):
             publisher.put(command)
-        ports.status.put(planner.status(now, (self._clock() - now) / NS_PER_US))
+        ports.status.put(planner.status(now, (self._clock() - now) / NS_PER_US, commands))
         if ports.checkpoint is not None:
             checkpoint = self._checkpoints.after(planner, now)
             if checkpoint is not None:

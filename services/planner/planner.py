@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cache
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,7 +48,7 @@ from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import GRAVITY, RobotConfig
 from shared.joints import MODULES, N_MODULES
 from shared.robot.hold_rules import Support
-from shared.rounding import DECIMALS, rounded
+from shared.rounding import FORCE, POSITION, RATE, rounded
 
 EARLY_FRACTION = 0.5
 """Minimum time between two ticks, as a fraction of a period."""
@@ -60,6 +61,8 @@ _ALL_NEW = (1 << N_MODULES) - 1
 # Constants, because each tick compares them (docs/contributing.md, The control path).
 _CARRIES = (int(Mode.HOLD), int(Mode.TRACK))
 _WAITING, _UNCERTIFIED = PlannerMode.WAITING, SplitSource.UNCERTIFIED
+_OF_COMMANDS: Final = (POSITION, RATE, FORCE, FORCE, FORCE, FORCE, FORCE)
+_OF_STATUS: Final = (POSITION, RATE, POSITION, POSITION, POSITION)
 
 
 class PlannerState(msgspec.Struct, kw_only=True):
@@ -436,12 +439,12 @@ class Planner:
     def _commands(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
         """Return the tick's six commands; each echoes the stamp of its module's state."""
         s, local, hold = self.state, output.local, self._hold()
-        margin, margin_onboard = rounded(local.margins)
+        margin, margin_onboard = rounded(local.margins, RATE)
         arrays = (
             output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
             local.D, local.D_B,
         )  # fmt: skip
-        rows = _rounded(arrays).tolist()
+        rows = _rounded(arrays, _OF_COMMANDS).tolist()
         pairs = [list(zip(row[::2], row[1::2], strict=True)) for row in rows]
         return [
             JointCommand(
@@ -519,8 +522,10 @@ class Planner:
         parts = self._supply.describe(s.supply), s.trust.describe(), refusal
         return "; ".join(filter(None, parts))
 
-    def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
-        """Return the inputs and decisions of the last tick."""
+    def status(
+        self, now_ns: int, tick_us: float, commands: Sequence[JointCommand] = ()
+    ) -> PlannerStatus:
+        """Return the inputs, decisions and commands of the last tick."""
         s, output, load = self.state, self._output, self.state.law.load
         seqs = [state.seq if state is not None else -1 for state in s.states]
         ages = [
@@ -533,8 +538,8 @@ class Planner:
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
             vectors = output.p, output.pdot, output.p_ref, output.closure, np.array(output.stance)
-            p, pdot, p_ref, closure, stance = map(vector6, _rounded(vectors))
-            margin, margin_onboard = rounded(output.local.margins)
+            p, pdot, p_ref, closure, stance = map(vector6, _rounded(vectors, _OF_STATUS))
+            margin, margin_onboard = rounded(output.local.margins, RATE)
         return PlannerStatus(
             t_ns=now_ns,
             seq=s.seq,
@@ -560,7 +565,7 @@ class Planner:
             attitude_seq=-1 if s.attitude is None else s.attitude.seq,
             slope=output.slope if output is not None else (0.0, 0.0),
             shift_requested=s.request.shift,
-            load=(round(load.kg, DECIMALS), *rounded((load.a, load.b))),
+            load=(round(load.kg, FORCE), *rounded((load.a, load.b), FORCE)),
             requested_by=s.request.source,
             stance=stance,
             why=self._why(),
@@ -569,14 +574,21 @@ class Planner:
             sit=s.request.sit,
             heat=int(s.heat.action),
             heat_left_s=s.heat.left_s,
-            supply_v=s.supply.volts,
+            supply_v=round(s.supply.volts, FORCE),
             wearer=int(s.park.reported(now_ns)) if self._park.enabled else 0,
             park_requested=int(s.request.park),
-            carried_n=round(carried_n, DECIMALS),
+            carried_n=round(carried_n, FORCE),
+            commands=tuple(commands),
         )
 
 
-def _rounded(vectors: Sequence[Array]) -> Array:
-    """Return the vectors as rows, rounded to `DECIMALS`."""
-    rows: Array = np.concatenate(vectors).round(DECIMALS).reshape(len(vectors), -1)
-    return rows
+def _rounded(vectors: Sequence[Array], decimals: tuple[int, ...]) -> Array:
+    """Return the vectors as rows, each rounded to some decimals."""
+    rows: Array = np.concatenate(vectors).reshape(len(vectors), -1)
+    per_unit = _per_unit(decimals)
+    return np.divide(np.rint(np.multiply(rows, per_unit, rows), rows), per_unit, rows)
+
+
+@cache
+def _per_unit(decimals: tuple[int, ...]) -> Array:
+    return np.array([[10.0**count] for count in decimals])

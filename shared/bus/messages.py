@@ -277,7 +277,10 @@ def name_of(kind: type[IntEnum], code: int) -> str:
 
 
 class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Base of all messages: the sender's monotonic time and a sequence number."""
+    """Base of all messages: the sender's monotonic time and a sequence number.
+
+    Fields that change in each message are next to each other, so that a log is shorter.
+    """
 
     t_ns: Int64
     """Time of the content, on the sender's monotonic clock."""
@@ -285,9 +288,15 @@ class Message(msgspec.Struct, gc=False, frozen=True, forbid_unknown_fields=True,
     """Sender's sequence number on this key."""
 
 
-class JointState(Message, frozen=True):
+class JointState(Message, frozen=True, kw_only=True):
     """State of one module."""
 
+    cycle: Int64
+    """Cycles since the start."""
+    command_seq: Int64
+    """Sequence number of the newest accepted command; -1: none."""
+    age_ns: Int64
+    """Its age (docs/architecture.md#age-rule); -1: none."""
     q: Pair
     """Joint angles (phi, theta), rad."""
     v: Pair
@@ -298,14 +307,8 @@ class JointState(Message, frozen=True):
     cause: Int64
     ready: bool
     """The module tracks as soon as `hold` is cleared."""
-    age_ns: Int64
-    """Age of the newest accepted command (docs/architecture.md#age-rule); -1: none."""
     session: Int64
     """Its session; 0: none."""
-    command_seq: Int64
-    """Its sequence number; -1: none."""
-    cycle: Int64
-    """Cycles since the start."""
     late: Int64
     """Cycles that began more than two periods after the previous one."""
     dropouts: Int64
@@ -334,15 +337,25 @@ class JointState(Message, frozen=True):
     """Supply voltage of the drive; 0: unknown."""
 
 
-class JointCommand(Message, frozen=True):
+class JointCommand(Message, frozen=True, kw_only=True):
     """Command to a module (docs/law.md#references-and-age)."""
 
     session: Int64
     """Random number of this planner session."""
-    echo_t_ns: Int64
-    """`t_ns` of this module's newest state."""
     hold: bool
     """True requests HOLD."""
+    margin: float
+    """Margin of the local gains of all six modules (docs/law.md#certificate)."""
+    margin_onboard: float
+    """Margin of the drives' own loops."""
+    stiffen: bool = False
+    """In HOLD, rise to the support gains."""
+    fallen: bool = False
+    """True: drop all stiffness."""
+    state_phase: Int64 = 0
+    """Cycle in which to send the next state (docs/architecture.md#rates)."""
+    echo_t_ns: Int64
+    """`t_ns` of this module's newest state."""
     q_ref: Pair
     """Reference, rad."""
     v_ref: Pair
@@ -357,16 +370,6 @@ class JointCommand(Message, frozen=True):
     """Local stiffness D, N m/rad."""
     k_d: Pair
     """Local damping D_B, N m s/rad."""
-    margin: float
-    """Margin of the local gains of all six modules (docs/law.md#certificate)."""
-    margin_onboard: float
-    """Margin of the drives' own loops."""
-    stiffen: bool = False
-    """In HOLD, rise to the support gains."""
-    state_phase: Int64 = 0
-    """Cycle in which to send the next state (docs/architecture.md#rates)."""
-    fallen: bool = False
-    """True: drop all stiffness."""
 
 
 class JointEvent(Message, frozen=True):
@@ -383,7 +386,7 @@ class JointEvent(Message, frozen=True):
     """Torque in the cycle of the change, N m."""
 
 
-class Wrench(Message, frozen=True):
+class Wrench(Message, frozen=True, kw_only=True):
     """Wrench of the operator on the torso, torso axes."""
 
     force: Vector3
@@ -427,47 +430,55 @@ class ToolRoster(Message, frozen=True):
     """Faults of recording and of the host's disk."""
 
 
-class PlannerStatus(Message, frozen=True):
+class PlannerStatus(Message, frozen=True, kw_only=True):
     """Inputs and decisions of one tick."""
 
     session: Int64
     """As in `JointCommand`."""
-    mode: Int64
-    hold: bool
-    """The commands request HOLD."""
+    state_seq: Modules
+    """Sequence number of each module's state; -1: none."""
+    state_age_ns: Modules
+    """Time since each module's newest state arrived; -1: none."""
+    wrench_seq: Int64
+    """Sequence number of the newest wrench; -1: none."""
+    attitude_seq: Int64 = -1
+    """Sequence number of the newest attitude; -1: none."""
+    tick_us: float
+    """Duration of the tick."""
     p: Vector6
     """Measured pose: COM x y z, m; torso roll, pitch, yaw, rad; world."""
     pdot: Vector6
     """Rate of `p`."""
-    p_ref: Vector6
-    """Reference of `p`."""
     closure: Vector6
     """Left leg's minus right leg's estimate of the torso pose, m and rad, world."""
-    assist_n: float
-    """Assist in the feedforward, plus the lift that stands the robot up."""
+    p_ref: Vector6
+    """Reference of `p`."""
+    load: Vector3 = (0.0, 0.0, 0.0)
+    """Load beyond that of the robot file, kg; its moments, N m (`services.planner.law.load`)."""
+    carried_n: float = 0.0
+    """Payload and person carried (docs/law.md#wearer); without a harness, the payload."""
+    supply_v: float = 0.0
+    """Lowest supply voltage, low-passed; 0: unknown."""
+    commands: tuple[JointCommand, ...] = ()
+    """The tick's commands, one per module; empty if it sent none. A log has them only here."""
     margin: float
     """As in `JointCommand`; 0 before the first tick."""
     margin_onboard: float
     """As in `JointCommand`."""
+    mode: Int64
+    hold: bool
+    """The commands request HOLD."""
+    assist_n: float
+    """Assist in the feedforward, plus the lift that stands the robot up."""
     split: Int64
     ik_iterations: Int64
     """Steps of the inverse kinematics."""
     ik_residual: float
     """Its largest residual, m or rad."""
-    tick_us: float
-    """Duration of the tick."""
-    state_seq: Modules
-    """Sequence number of each module's state; -1: none."""
-    wrench_seq: Int64
-    """Sequence number of the newest wrench; -1: none."""
     assist_requested_n: float
     """Operator's request."""
-    state_age_ns: Modules
-    """Time since each module's newest state arrived; -1: none."""
     wait_s: float = 0.0
     """Remaining wait after dropouts."""
-    attitude_seq: Int64 = -1
-    """Sequence number of the newest attitude; -1: none."""
     slope: Pair = (0.0, 0.0)
     """Slope of the floor along x and y, rad."""
     shift_requested: Vector4 = STRAIGHT
@@ -477,8 +488,6 @@ class PlannerStatus(Message, frozen=True):
     why: str = ""
     """Warnings about supply, harness and heat, and why the planner does not lead."""
     trip: Int64 = 0
-    load: Vector3 = (0.0, 0.0, 0.0)
-    """Load beyond that of the robot file, kg; its moments, N m (`services.planner.law.load`)."""
     requested_by: str = ""
     """Source of the intent in use; empty: none."""
     refused: Int64 = 0
@@ -488,10 +497,6 @@ class PlannerStatus(Message, frozen=True):
     heat: Int64 = 0
     heat_left_s: float = -1.0
     """Smallest `heat_left_s` of the modules."""
-    supply_v: float = 0.0
-    """Lowest supply voltage, low-passed; 0: unknown."""
-    carried_n: float = 0.0
-    """Payload and person carried (docs/law.md#wearer); without a harness, the payload."""
     wearer: Int64 = 0
     """`LEADS` also if `park.enabled` is false."""
     park_requested: Int64 = 0

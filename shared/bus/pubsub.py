@@ -19,7 +19,7 @@ from shared import log
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import Message
 from shared.bus.traces import Batch
-from shared.clock import now_ns
+from shared.clock import NS_PER_MS, now_ns
 from shared.exceptions import EncodeError
 
 M = TypeVar("M", bound=Message)
@@ -206,24 +206,31 @@ class Recording(Stream):
         super().__init__(subscribers)
         self._keys_by_batch = keys_by_batch
         self._decoder = Decoder(Batch)
-        self._waiting: deque[tuple[str, bytes]] = deque()
+        self._waiting: deque[tuple[str, bytes, int]] = deque()
 
     def take(self) -> tuple[str, bytes, int] | None:
         """Return (key, payload, time in monotonic ns) of the oldest message, or None.
 
-        A message that the batch's sender may not put is dropped. A malformed batch is returned as
-        it is, and the recorder counts its key as unknown.
+        The time is rounded up to a millisecond, because equal times make a log shorter. A message
+        that the batch's sender may not put is dropped. A malformed batch is returned as it is, and
+        the recorder counts its key as unknown.
         """
         while not self._waiting:
             sample = super().take()
-            if sample is None or sample[0] not in self._keys_by_batch:
-                return sample
-            allowed = self._keys_by_batch[sample[0]]
-            batch = self._decoder.decode(sample[1])
+            if sample is None:
+                return None
+            name, payload, at_ns = sample
+            at_ns = -(-at_ns // NS_PER_MS) * NS_PER_MS
+            if name not in self._keys_by_batch:
+                return name, payload, at_ns
+            allowed = self._keys_by_batch[name]
+            batch = self._decoder.decode(payload)
             if batch is None:
-                return sample
-            self._waiting.extend((k, bytes(raw)) for k, raw in batch.messages if k in allowed)
-        return *self._waiting.popleft(), now_ns()
+                return name, payload, at_ns
+            self._waiting.extend(
+                (k, bytes(raw), at_ns) for k, raw in batch.messages if k in allowed
+            )
+        return self._waiting.popleft()
 
 
 def _attachment(key: str) -> zenoh.ZBytes:

@@ -70,7 +70,7 @@ JOINT_BATCH: Final = Topic(
 )  # fmt: skip
 PLANNER_BATCH: Final = Topic(
     "planner/batch", traces.Batch, 250.0, _DATA, ("planner",), (),
-    "commands, status and checkpoints, for the recorder", recorded=False,
+    "status and checkpoints, for the recorder", recorded=False,
 )  # fmt: skip
 JOINT_STATE: Final = Topic(
     "joint/*/state", messages.JointState, 250.0, _REAL_TIME, ("*",), ("planner",),
@@ -78,7 +78,7 @@ JOINT_STATE: Final = Topic(
 )  # fmt: skip
 JOINT_COMMAND: Final = Topic(
     "joint/*/command", messages.JointCommand, 250.0, _REAL_TIME, ("planner",), ("*",),
-    "references, gains and torques", batch=PLANNER_BATCH,
+    "references, gains and torques (recorded in `planner/status`)", recorded=False,
 )  # fmt: skip
 JOINT_EVENT: Final = Topic(
     "joint/*/event", messages.JointEvent, 0.0, _DATA, ("*",), (),
@@ -127,7 +127,7 @@ SIM_TRUTH: Final = Topic(
     "true state, for the verdict",
 )  # fmt: skip
 SIM_STATE: Final = Topic(
-    "sim/state", traces.SimState, 10.0, _BACKGROUND, ("simulator",), (),
+    "sim/state", traces.SimState, 5.0, _BACKGROUND, ("simulator",), (),
     "complete state, for `xrl log whatif`",
 )  # fmt: skip
 SIM_CONTROL: Final = Topic(

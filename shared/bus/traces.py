@@ -5,60 +5,102 @@ Of the services, only the recorder subscribes to them. Re-execution reads the in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import accumulate, chain, pairwise
+from typing import Final
+
 import msgspec
 
 from shared.bus.messages import Int64, Message, Pair, Vector3
 
+Ints = tuple[Int64, ...]
+Floats = tuple[float, ...]
+Bools = tuple[bool, ...]
+_values: Final = msgspec.structs.astuple
+
 
 class CycleTrace(msgspec.Struct, gc=False, frozen=True):
-    """Inputs and decision of one cycle."""
+    """Inputs and decision of one cycle: a row of `CycleColumns`."""
 
     now_ns: Int64
     sampled_ns: Int64
-    """Arrival of the drive's sample; -1: none, and the next six fields are invalid."""
     pos: Pair
-    """Motor positions from the joint's zero, turns."""
     vel: Pair
-    """Motor rates, turn/s."""
     status: Int64
-    """`DriveStatus`."""
     error: Int64
-    """Error bits of the drive."""
     carried: Pair
-    """Motor torques of a drive that was found armed, N m."""
     carries: bool
-    """`carried` is valid."""
     session: Int64
-    """Session of this cycle's command; 0: no command."""
     command_seq: Int64
-    """Its sequence number; -1: no command."""
     estop: bool
-    """The emergency stop is engaged."""
     drive_command: Int64
+    below: Pair = (0.0, 0.0)
+    knows_below: bool = False
+    sinks: bool = True
+    stiffen: bool = False
+    malformed: Int64 = 0
+    encoder_zero: Pair = (-1.0, -1.0)
+    fet_celsius: Pair = (0.0, 0.0)
+    motor_celsius: Pair = (0.0, 0.0)
+    supply_v: float = 0.0
+    ended: Int64 = 0
+
+
+class CycleColumns(msgspec.Struct, gc=False, frozen=True):
+    """Inputs and decisions of consecutive cycles, oldest first.
+
+    Columns take two thirds of the space that rows take in a log. A column of pairs is flat.
+    """
+
+    now_ns: Ints
+    """Time since the previous cycle; the first is 0. In a row: the time."""
+    sampled_ns: Ints
+    """Age of the drive's sample; -1: none, and the next six fields are invalid. In a row: the time
+    of its arrival."""
+    pos: Floats
+    """Motor positions from the joint's zero, turns."""
+    vel: Floats
+    """Motor rates, turn/s."""
+    status: Ints
+    """`DriveStatus`."""
+    error: Ints
+    """Error bits of the drive."""
+    carried: Floats
+    """Motor torques of a drive that was found armed, N m."""
+    carries: Bools
+    """`carried` is valid."""
+    session: Ints
+    """Session of this cycle's command; 0: no command."""
+    command_seq: Ints
+    """Its sequence number; -1: no command."""
+    estop: Bools
+    """The emergency stop is engaged."""
+    drive_command: Ints
     """Command to the drive: 0 none, 1 torques, 2 target, 3 idle, 4 arm, 5 clear the zero, 6 clear
     errors."""
-    tau: Pair
-    """Joint torques after the limiter, N m."""
-    below: Pair = (0.0, 0.0)
+    below: Floats
     """Theta and rate of ankle plus knee (for a hip) or knee (for an ankle), rad, rad/s."""
-    knows_below: bool = False
+    knows_below: Bools
     """`below` is valid."""
-    sinks: bool = True
+    sinks: Bools
     """False: this knee must not sink."""
-    stiffen: bool = False
+    stiffen: Bools
     """This module must stiffen: another is limp."""
-    malformed: Int64 = 0
+    malformed: Ints
     """Malformed payloads."""
-    encoder_zero: Pair = (-1.0, -1.0)
+    encoder_zero: Floats
     """Positions at which the encoders read 0, turns modulo one; -1: not reported."""
-    fet_celsius: Pair = (0.0, 0.0)
+    fet_celsius: Floats
     """Output stages' temperatures; 0: not reported."""
-    motor_celsius: Pair = (0.0, 0.0)
+    motor_celsius: Floats
     """Motors' temperatures; 0: not reported."""
-    supply_v: float = 0.0
+    supply_v: Floats
     """As in `JointState`."""
-    ended: Int64 = 0
+    ended: Ints
     """Session of a planner that ended on this host; 0: none."""
+
+
+_PAIRS: Final = tuple(f.name for f in msgspec.structs.fields(CycleTrace) if f.type == Pair)
 
 
 class JointTrace(Message, frozen=True):
@@ -66,8 +108,38 @@ class JointTrace(Message, frozen=True):
 
     snapshot: str
     """State before these cycles, as JSON; empty in most messages."""
-    cycles: tuple[CycleTrace, ...]
-    """Oldest first."""
+    columns: CycleColumns
+
+    @classmethod
+    def of(cls, cycles: Sequence[CycleTrace], seq: int, snapshot: str) -> JointTrace:
+        """Return a trace of consecutive cycles, oldest first."""
+        rows = zip(*map(_values, cycles), strict=True)
+        columns = dict(zip(CycleTrace.__struct_fields__, rows, strict=True))
+        for name in _PAIRS:
+            columns[name] = tuple(chain.from_iterable(columns[name]))
+        now_ns, sampled_ns = columns["now_ns"], columns["sampled_ns"]
+        columns["now_ns"] = (0, *(b - a for a, b in pairwise(now_ns)))
+        columns["sampled_ns"] = tuple(
+            now - sampled if sampled >= 0 else -1
+            for now, sampled in zip(now_ns, sampled_ns, strict=True)
+        )
+        return cls(t_ns=now_ns[-1], seq=seq, snapshot=snapshot, columns=CycleColumns(**columns))
+
+    @property
+    def cycles(self) -> list[CycleTrace]:
+        """The cycles, oldest first."""
+        columns = msgspec.structs.asdict(self.columns)
+        for name in _PAIRS:
+            column = columns[name]
+            columns[name] = zip(column[::2], column[1::2], strict=True)
+        steps_ns = columns["now_ns"]
+        now_ns = tuple(accumulate(steps_ns, initial=self.t_ns - sum(steps_ns)))[1:]
+        columns["now_ns"] = now_ns
+        columns["sampled_ns"] = tuple(
+            now - age if age != -1 else -1
+            for now, age in zip(now_ns, columns["sampled_ns"], strict=True)
+        )
+        return [CycleTrace(*row) for row in zip(*columns.values(), strict=True)]
 
 
 class PlannerCheckpoint(Message, frozen=True):
@@ -78,7 +150,7 @@ class PlannerCheckpoint(Message, frozen=True):
     """State, as JSON."""
 
 
-class SimTruth(Message, frozen=True):
+class SimTruth(Message, frozen=True, kw_only=True):
     """True state, world axes."""
 
     scenario_s: float

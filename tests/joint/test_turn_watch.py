@@ -32,7 +32,7 @@ from services.joint.turn_watch import (
 from shared.bus.messages import DriveStatus, Pair
 from shared.can.cansimple import AxisError
 from shared.clock import NS_PER_MS, NS_PER_S
-from shared.rounding import rounded
+from shared.rounding import POSITION, rounded
 
 T_NS = NS_PER_S
 PERIOD_NS = 2 * NS_PER_MS
@@ -319,7 +319,7 @@ def test_a_motor_moves_no_further_than_its_speed_and_a_margin_explain(
     event = samples.process(reading(T_NS + PERIOD_NS, (moved[0], moved[1])), armed=True)
     assert event is (Event.DRIVE_ARMED if accepted else Event.NONE)
     assert list(samples.pos) == (moved if accepted else before)
-    assert samples.q == rounded(joint_from_motor(samples.pos, N))
+    assert samples.q == rounded(joint_from_motor(samples.pos, N), POSITION)
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ def test_its_output_is_what_is_sent() -> None:
             sent.append(message.tau_coupled)  # type: ignore[attr-defined]  # a command
 
     fleet_of(0.6, push_forward, record=record)
-    assert sent[-1][0] == pytest.approx(outputs[-1].tau_coupled[8] + 0.25, abs=6e-7)
+    assert sent[-1][0] == pytest.approx(outputs[-1].tau_coupled[8] + 0.25, abs=6e-4)
 
 
 def test_on_a_slope_it_is_followed_as_on_the_level() -> None:

@@ -37,6 +37,9 @@ _HEAD: Final = ("t_ns", "seq")
 """Fields of the first columns."""
 FOR_REEXECUTION: Final = (topics.JOINT_TRACE, topics.PLANNER_CHECKPOINT, topics.SIM_STATE)
 
+_OF_OTHER_TABLES: Final = "commands"
+"""Field of `PlannerStatus` whose elements are the rows of the tables `joint.*.command`."""
+
 Columns = Mapping[str, Sequence[Any]]
 """Values by name, all of the same length; None for an empty cell."""
 
@@ -81,6 +84,8 @@ def columns_of(kind: type[msgspec.Struct]) -> dict[str, Reader]:
     found: dict[str, Reader] = {}
     fields = msgspec.structs.fields(kind)
     for field in sorted(fields, key=lambda field: field.name not in _HEAD):
+        if field.name == _OF_OTHER_TABLES:
+            continue
         _add_column(found, field.name, field.type, attrgetter(field.name))
     return found
 

@@ -28,7 +28,7 @@ from tools.keys.authority import held_files
 from tools.keys.inspection import inspect_keys
 
 FREE_MIB: Final = 4096
-"""Free space below which a warning is given, MiB; an hour of recording takes up to 1.7 GiB."""
+"""Free space below which a warning is given, MiB; an hour of recording takes 0.8 GiB."""
 LOCKS: Final = ("requirements.lock", "requirements.runtime.lock")
 
 

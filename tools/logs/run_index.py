@@ -1,6 +1,6 @@
 """Index of a run's files: metadata, attachments, and the places of the messages.
 
-A record of one hour takes 2 GiB, and ten times that in memory. So its files are skimmed
+A record of one hour takes 0.8 GiB, and ten times that in memory. So its files are skimmed
 once, and `tools/logs/run_log.py` reads only the needed parts. A split run consists of several files
 in one directory.
 """

@@ -23,6 +23,7 @@ import msgspec
 
 from services.planner.controller import ATTACHED
 from shared.bus import topics
+from shared.bus.messages import PlannerStatus
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
@@ -30,6 +31,7 @@ from shared.config.gain_table import GainSchedule
 from shared.config.robot_config import RobotConfig
 from shared.config.sections import WearerThresholds
 from shared.exceptions import RunError
+from shared.joints import MODULE_INDEX, N_MODULES
 from shared.mcap_log.sequence_stats import KeyCount
 from shared.toml_file import decoded, parse_toml
 from tools.logs.run_index import RunIndex
@@ -151,6 +153,8 @@ class RunLog:
         Raises RunError if another version wrote them, or the module does not fit the topic.
         """
         key = self._key(topic, module)
+        if topic is topics.JOINT_COMMAND:
+            return [status.commands[MODULE_INDEX[module]] for _, status in self._commanding()]
         series = self._of(key)
         if series.decoded is None:
             decode = msgspec.json.Decoder(topic.type).decode
@@ -183,6 +187,8 @@ class RunLog:
 
         The times are on the monotonic clock of the recorder's host.
         """
+        if topic is topics.JOINT_COMMAND:
+            return [at_ns for at_ns, _ in self._commanding()]
         return self._of(self._key(topic, module)).received_ns
 
     def holds(self, received_ns: int) -> bool:
@@ -230,6 +236,13 @@ class RunLog:
             msgspec.structs.replace(message, t_ns=t_ns)
             for message, t_ns in zip(messages, times_ns, strict=True)
         ]
+
+    def _commanding(self) -> list[tuple[int, PlannerStatus]]:
+        """Return the statuses that contain commands, each with the time of its reception."""
+        statuses: list[PlannerStatus] = self.messages(topics.PLANNER_STATUS)
+        received = self.received_ns(topics.PLANNER_STATUS)
+        rows = zip(received, statuses, strict=True)
+        return [row for row in rows if len(row[1].commands) == N_MODULES]
 
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):

@@ -69,9 +69,11 @@ class _CentralPlanner(Planner):
         states: Sequence[JointState] = [state for state in self.state.states if state is not None]
         return [_whole(*pair) for pair in zip(commands, states, strict=True)] if commands else []
 
-    def status(self, now_ns: int, tick_us: float) -> PlannerStatus:
-        """Return inputs and decisions of the last tick; margins are 0, as no tier holds alone."""
-        status = super().status(now_ns, tick_us)
+    def status(
+        self, now_ns: int, tick_us: float, commands: Sequence[JointCommand] = ()
+    ) -> PlannerStatus:
+        """Return the status of the last tick; margins are 0, as no tier holds alone."""
+        status = super().status(now_ns, tick_us, commands)
         return msgspec.structs.replace(status, margin=0.0, margin_onboard=0.0)
 
 

@@ -50,11 +50,13 @@ class RecordedMessages:
         return len(self._queue)
 
     def put(self, topic: Topic, module: str, message: Message) -> None:
-        """Queue a message as the bus would.
+        """Queue a message of a recorded topic as the bus would.
 
         Arrival times never decrease, although a joint service with a silent drive stamps its states
         with the time of the last sample.
         """
+        if not topic.recorded:
+            return
         self._newest_ns = max(self._newest_ns, message.t_ns)
         self._queue.append((topic.key(self._robot, module), encode(message), self._newest_ns))
 

@@ -22,7 +22,7 @@ from shared.can.cansimple import AxisState, ControlMode, InputMode
 from shared.can.interface import QUEUED_MAX
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.sections import DriveConfig
-from shared.rounding import rounded
+from shared.rounding import RATE, TURNS, rounded
 
 ASK_EVERY_NS: Final = 100 * NS_PER_MS
 """Period of heartbeats, ns; the CAN driver requests an idle axis's count at each of them."""
@@ -156,8 +156,8 @@ class VirtualDrive:
             self._supply_v = bank.bus.state(a // 2)[0]
         return DriveReading(
             self._sampled_ns,
-            rounded((float(pos[a]), float(pos[b]))),
-            rounded((float(vel[a]), float(vel[b]))),
+            rounded((float(pos[a]), float(pos[b])), TURNS),
+            rounded((float(vel[a]), float(vel[b])), RATE),
             status,
             int(errors),
             None if self._written else (float(bank.torque[a]), float(bank.torque[b])),

@@ -19,7 +19,6 @@ from services.simulator.physics.posture import SoleLoad
 from shared.bus import topics
 from shared.bus.messages import (
     HandLead,
-    JointCommand,
     JointState,
     Message,
     Mode,
@@ -50,7 +49,6 @@ LEAST_N: Final = 20.0
 
 _TOPICS: Final = (
     topics.PLANNER_STATUS, topics.WRENCH, topics.SIM_TRUTH, topics.RUN_EVENT, topics.JOINT_STATE,
-    topics.JOINT_COMMAND,
 )  # fmt: skip
 SHOWN: Final = tuple(key for key in every_key() if key.topic in _TOPICS)
 """Keys of the messages that a frame needs."""
@@ -182,8 +180,7 @@ class Newest:
         else:
             newest = self._rows.get((topics.PLANNER_STATUS.name, ""))
             torso, angles, com = pose_of_legs(self._kinematics, q, newest)
-        commands: list[JointCommand] = self._of_modules(topics.JOINT_COMMAND)
-        led = status is not None and len(commands) == len(MODULES)
+        commands = () if status is None else status.commands
         soles, estimated = self._soles_of(truth, states)
         begun = truth is not None and truth.scenario_s >= 0.0
         t_s = self.scenario_s if begun else (now_ns - self._first_ns) / NS_PER_S
@@ -194,7 +191,7 @@ class Newest:
             angles=_vector(angles),
             com=_vector(com),
             q=_short(q),
-            q_ref=_short(angle for row in commands for angle in row.q_ref) if led else (),
+            q_ref=_short(angle for row in commands for angle in row.q_ref),
             modes=tuple(s.mode if here else -1 for s, here in zip(states, heard, strict=True)),
             drives=tuple(state.drive for state in states),
             ages_ms=_short(

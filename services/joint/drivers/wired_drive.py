@@ -15,7 +15,7 @@ import msgspec
 
 from services.joint.drivers.base import Drive, DriveReading, MotorTarget
 from shared.bus.messages import LOST_DRIVE, DriveStatus, Pair
-from shared.rounding import rounded
+from shared.rounding import RATE, TURNS, rounded
 
 Signs = tuple[int, int]
 """Signs of axis0 and axis1; -1 if the motor counts down where the differential counts up."""
@@ -43,8 +43,8 @@ class MotorFrame(NamedTuple):
             status = DriveStatus.UNZEROED
         return DriveReading(
             int(reading.t_ns),
-            rounded((a, b)),
-            rounded((float(vel_a) * sign_a, float(vel_b) * sign_b)),
+            rounded((a, b), TURNS),
+            rounded((float(vel_a) * sign_a, float(vel_b) * sign_b), RATE),
             status,
             int(reading.error),
             None if torque is None else self.torque((float(torque[0]), float(torque[1]))),

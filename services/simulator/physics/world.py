@@ -7,7 +7,8 @@ It steps the true robot (`services.simulator.physics.body`) without a robot file
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,13 @@ from services.simulator.physics.actuation import Actuation
 from services.simulator.physics.body import Body, FootPlacement
 from services.simulator.physics.operator import LedHand
 from services.simulator.physics.outside import OutsideForces, Torso
-from services.simulator.physics.posture import as_vector, measure_posture, sole_loads
+from services.simulator.physics.posture import measure_posture, sole_loads
 from shared.arrays import Array
 from shared.bus.messages import HandLead
 from shared.bus.traces import SimState, SimTruth
 from shared.config.scenarios import Lead, Scenario
 from shared.extras import late
+from shared.rounding import POSITION
 
 if TYPE_CHECKING:
     import mujoco
@@ -234,29 +236,41 @@ class World:
         return SimTruth(
             t_ns=t_ns,
             seq=self._truths,
-            scenario_s=self.scenario_s,
-            com=posture.com,
-            torso=posture.torso,
-            angles=posture.angles,
-            operator_force=(outside.hand_ahead, outside.hand_side, outside.hand.force_z),
-            operator_moment=as_vector(moment),
-            load_n=outside.wearer.load_n,
-            harness_force_z=outside.wearer.load_n - outside.hand.force_z,
-            push=outside.push,
-            foot_right_tilt=posture.tilts[0],
-            foot_left_tilt=posture.tilts[1],
-            feet_slip=posture.slip,
-            hoist=outside.hoist.share,
             fallen=self._fallen,
-            real_time_factor=real_time_factor,
-            late_s=late_s,
-            lean=self._lean,
-            foot_right_force=right.force,
-            foot_left_force=left.force,
-            foot_right_cop=right.cop,
-            foot_left_cop=left.cop,
-            feet=posture.feet,
+            **_rounded(
+                scenario_s=self.scenario_s,
+                com=posture.com,
+                torso=posture.torso,
+                angles=posture.angles,
+                operator_force=(outside.hand_ahead, outside.hand_side, outside.hand.force_z),
+                operator_moment=moment.tolist(),
+                load_n=outside.wearer.load_n,
+                harness_force_z=outside.wearer.load_n - outside.hand.force_z,
+                push=outside.push,
+                foot_right_tilt=posture.tilts[0],
+                foot_left_tilt=posture.tilts[1],
+                feet_slip=posture.slip,
+                hoist=outside.hoist.share,
+                real_time_factor=real_time_factor,
+                late_s=late_s,
+                lean=self._lean,
+                foot_right_force=right.force,
+                foot_left_force=left.force,
+                foot_right_cop=right.cop,
+                foot_left_cop=left.cop,
+                feet=posture.feet,
+            ),
         )
+
+
+def _rounded(**fields: float | Sequence[float]) -> dict[str, Any]:
+    """Return the fields, each number rounded to `POSITION` decimals."""
+    return {
+        name: tuple(round(float(number), POSITION) for number in value)
+        if isinstance(value, Sequence)
+        else round(float(value), POSITION)
+        for name, value in fields.items()
+    }
 
 
 def _turn_between(start: Array, end: Array) -> Array:

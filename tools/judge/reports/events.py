@@ -113,7 +113,7 @@ class Events:
     def _add_silences(self, run: RunData) -> None:
         """Add the gaps of periodic topics, by the recorder's clock."""
         for key, topic in topics.all_keys(run.log.robot).items():
-            if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE:
+            if topic.rate_hz < 10.0 or topic is topics.JOINT_TRACE or not topic.recorded:
                 continue
             module = key.split("/")[-2] if topic.per_module else ""
             t = run.on_axis(run.log.received_ns(topic, module))

@@ -86,7 +86,7 @@ def moments_of(log: RunLog, robot: RobotConfig, every_s: float) -> list[Moment]:
     if not found:
         raise RunError(
             f"{log.path}: contains no states of the simulated world (sim/state). Simulated runs of "
-            "this version contain one every 0.1 s of the scenario; a real robot's runs contain none"
+            "this version contain one every 0.2 s of the scenario; a real robot's runs contain none"
         )
     for name in MODULES:
         joint = JointExecution(robot, name, ReexecutionResult(name, 0.0, exact=False))

@@ -235,7 +235,7 @@ def likely_reason(recorded: Origin, here: Origin) -> str:
     if differing:
         line = f"likely reason: recorded with {'; '.join(differing)}"
         if not all(each.startswith("code ") for each in differing):
-            line += "; `--tolerance 2e-6` accepts what another machine rounds differently"
+            line += "; `--tolerance 2e-3` accepts what another machine rounds differently"
     else:
         line = f"no reason known: {'no known fact differs' if untold else 'the same environment'}"
     return f"{line} (unknown: {', '.join(untold)})" if untold else line

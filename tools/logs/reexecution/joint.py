@@ -176,9 +176,9 @@ class JointExecution:
     def _execute(self, loop: JointLoop, trace: CycleTrace) -> Iterator[tuple[str, Message]]:
         step, controller, sent = loop.cycle(), loop.module.state.controller, self._cycle.sent
         self.outcome.ticks += 1
-        drive_command, tau = step.command.value, controller.tau
-        if drive_command != trace.drive_command or tau != trace.tau:
-            computed = msgspec.structs.replace(trace, drive_command=drive_command, tau=tau)
+        drive_command = step.command.value
+        if drive_command != trace.drive_command:
+            computed = msgspec.structs.replace(trace, drive_command=drive_command)
             self._compare("trace", controller.cycle, _single(trace), _single(computed))
         for message in sent:
             recorded: Message | None
@@ -200,7 +200,7 @@ class JointExecution:
 
 
 def _single(cycle: CycleTrace) -> JointTrace:
-    return JointTrace(t_ns=cycle.now_ns, seq=0, snapshot="", cycles=(cycle,))
+    return JointTrace.of([cycle], seq=0, snapshot="")
 
 
 def _reading(c: CycleTrace) -> DriveReading | None:

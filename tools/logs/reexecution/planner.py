@@ -13,7 +13,7 @@ from services.planner.intents import OperatorRequest
 from services.planner.loop import PlannerLoop, PlannerPorts
 from services.planner.planner import Planner, PlannerState
 from shared.bus import topics
-from shared.bus.messages import Attitude, JointCommand, Message, PlannerStatus, Wrench
+from shared.bus.messages import Attitude, Message, PlannerStatus, Wrench
 from shared.bus.traces import PlannerCheckpoint
 from shared.config.robot_config import RobotConfig
 from shared.joints import MODULES
@@ -71,14 +71,13 @@ class _Tick:
         self.wrench = _LoggedInbox[Wrench]()
         self.attitude = _LoggedInbox[Attitude]()
         self.request = OperatorRequest()
-        self.commands = _KeptOutbox[JointCommand]()
         self.status = _KeptOutbox[PlannerStatus]()
         self.ports = PlannerPorts(
             states=(),  # `_receive` passes each with its arrival time
             wrench=self.wrench,
             attitude=self.attitude,
             request=lambda _now_ns: self.request,
-            commands=[self.commands] * len(MODULES),
+            commands=(),  # the status has them
             status=self.status,
             checkpoint=None,
         )
@@ -124,11 +123,6 @@ class PlannerExecution:
         self._states = [_BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
         self._wrenches = _BySeq(log.messages(topics.WRENCH))
         self._attitudes = _BySeq(log.messages(topics.ATTITUDE))
-        self._commands: dict[tuple[str, int, int], JointCommand] = {
-            (name, command.session, command.seq): command
-            for name in MODULES
-            for command in log.messages(topics.JOINT_COMMAND, name)
-        }
 
     def snapshot(self) -> tuple[int, PlannerState] | None:
         """Return the planner's session and present state, or None if it cannot be executed."""
@@ -190,17 +184,15 @@ class PlannerExecution:
         outcome, compare, tick = self.outcome, self.outcome.comparison.take, self._tick
         loop.tick(status.t_ns)
         outcome.ticks += 1
-        for name, command in zip(MODULES, tick.commands.messages, strict=False):
-            recorded = self._commands.get((name, status.session, command.seq))
-            if recorded is not None:
-                compare(f"joint/{name}/command", status.seq, recorded, command)
-                yield topics.JOINT_COMMAND.key(self._log_robot, name), command
         (computed,) = tick.status.messages
-        tick.commands.messages.clear()
         tick.status.messages.clear()
+        for name, recorded, command in zip(
+            MODULES, status.commands, computed.commands, strict=False
+        ):
+            compare(f"joint/{name}/command", status.seq, recorded, command)
         # tick_us is a measured time
-        computed = msgspec.structs.replace(computed, tick_us=status.tick_us)
-        compare("planner/status", status.seq, status, computed)
+        alone = msgspec.structs.replace(computed, tick_us=status.tick_us, commands=())
+        compare("planner/status", status.seq, msgspec.structs.replace(status, commands=()), alone)
         yield topics.PLANNER_STATUS.key(self._log_robot), computed
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:

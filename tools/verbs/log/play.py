@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from operator import attrgetter
 from typing import Annotated, Final, NamedTuple, Protocol
 
 import msgspec
@@ -81,13 +82,13 @@ class Entry(NamedTuple):
 
 
 def entries(index: RunIndex, part: RunPart, keys: Collection[str]) -> Iterator[Entry]:
-    """Yield a part's messages of some keys in the order of the files; hold one chunk in memory."""
+    """Yield a part's messages of some keys as they were recorded; hold one chunk in memory."""
     begin_ns = index.began_ns + round(part.begin_s * NS_PER_S)
     end_ns = index.ended_ns + 1
     if part.end_s < index.length_s:
         end_ns = index.began_ns + math.ceil(part.end_s * NS_PER_S)
     for record, known in index.records(begin_ns, end_ns, frozenset(keys)):
-        for channel, _, log_ns, _, start, end in record.rows:
+        for channel, _, log_ns, _, start, end in sorted(record.rows, key=attrgetter("log_ns")):
             key = known.get(channel, "")
             if key in keys and begin_ns <= log_ns < end_ns:
                 yield Entry(log_ns - begin_ns, key, record.body[start:end])

@@ -10,6 +10,7 @@ from rich.text import Text
 
 from services.simulator.physics.plant import PlantConfig
 from shared.atomic_file import replace_file
+from shared.bus.topics import SIM_STATE
 from shared.config import scenarios
 from shared.config.scenarios import Scenario
 from shared.exceptions import FELL_EXIT_CODE, RunError
@@ -33,7 +34,7 @@ from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, refuse_own_controller, robot_of, text_of
 from tools.terminal import Console, marked
 
-STATE_EVERY_S: Final = 0.1 - 1e-9
+STATE_EVERY_S: Final = 1.0 / SIM_STATE.rate_hz - 1e-9
 """Period at which the simulated world's state is recorded, less a margin for rounding, s."""
 KILLABLE: Final = ("planner", *MODULES)
 WIDTH: Final = 72
@@ -58,8 +59,8 @@ class WhatIfFlags(PartFlags):
             help="planner or a module, such as knee_left; repeatable: all are killed together",
         ),
     ]
-    every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.1
-    """time between two kills; at least 0.1 s, the period of the recorded states"""
+    every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.2
+    """time between two kills; at least 0.2 s, the period of the recorded states"""
     for_s: Annotated[Duration, option("--for", metavar="S")] = 4.0
     """duration of each continued run, with pushes and hand as recorded"""
     workers: Annotated[Count | None, Arg(metavar="N")] = None

@@ -40,8 +40,7 @@ def test_the_kill_the_hold_and_the_recovery_are_there_in_order(log: RunLog) -> N
     hold = next(row for row in rows if "TRACK to HOLD, PLANNER_ENDED" in row.text)
     assert hold.text.startswith("all six: ")
     assert 0.0 < hold.t - kill.t < 0.065
-    silence = next(text for text in texts if "silent for up to 0." in text)
-    assert {"joint/*/command", "planner/status"} <= set(silence.replace(",", "").split())
+    assert any(text.startswith("planner/status silent for 0.") for text in texts)
     assert not any("state silent" in text for text in texts), "its drive was, not the service"
     assert any(text.startswith("drive of hip_left: ARMED to ") for text in texts)
     assert {row.kind for row in rows if row.mark} == {"kill", "restart", "push", "fault"}

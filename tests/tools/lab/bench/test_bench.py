@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from shared.bus import codec, topics
-from shared.bus.messages import JointCommand
+from shared.bus.messages import JointCommand, PlannerStatus
 from shared.bus.traces import CycleTrace, JointTrace
 from shared.clock import NS_PER_MS
 from shared.config import scenarios
@@ -47,14 +47,15 @@ def test_an_age_is_that_of_a_leading_command_in_the_cycle_that_took_it(tmp_path:
         sample(JointCommand, session=7, seq=seq, echo_t_ns=100 * NS_PER_MS * seq, hold=hold)
         for seq, hold in ((1, False), (2, True), (3, False))
     ]
-    cycles = tuple(
+    cycles = [
         cycle(now_ms, seq)
         for now_ms, seq in ((102.0, 1), (104.0, -1), (203.0, 2), (305.5, 3), (405.0, 4))
-    )
-    sent = topics.JOINT_COMMAND.key(ROBOT, "knee_left")
+    ]
+    sent = topics.PLANNER_STATUS.key(ROBOT)
     traced = topics.JOINT_TRACE.key(ROBOT, "knee_left")
-    items = [(sent, codec.encode(one), number) for number, one in enumerate(commands)]
-    trace = sample(JointTrace, cycles=cycles, snapshot="")
+    statuses = [sample(PlannerStatus, commands=(command,) * 6) for command in commands]
+    items = [(sent, codec.encode(one), number) for number, one in enumerate(statuses)]
+    trace = JointTrace.of(cycles, seq=1, snapshot="")
     write(tmp_path, [*items, (traced, codec.encode(trace), len(items))])
     assert fleet.first_use_ms(read_run(tmp_path)).tolist() == [2.0, 5.5]
 

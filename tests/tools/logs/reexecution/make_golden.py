@@ -25,7 +25,6 @@ TOPICS: Final = (
     topics.PLANNER_STATUS,
     topics.PLANNER_CHECKPOINT,
     topics.JOINT_STATE,
-    topics.JOINT_COMMAND,
     topics.JOINT_EVENT,
     topics.WRENCH,
 )

@@ -23,7 +23,7 @@ from shared.config.scenarios import Fault, Kill, Restart
 from shared.exceptions import FAULT_EXIT_CODE
 from shared.joints import MODULES
 from shared.mcap_log import provenance
-from shared.rounding import DECIMALS
+from shared.rounding import POSITION
 from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tests.shared.mcap_log.runs import recorded_in_parts, state
@@ -160,11 +160,13 @@ def test_the_planner_of_the_record_knew_the_slope(log: RunLog) -> None:
 
 
 def test_the_last_digit_of_one_recorded_number_is_found_where_it_was_taken(log: RunLog) -> None:
-    commands = log.messages(topics.JOINT_COMMAND, "hip_left")
-    old = commands[len(commands) // 2]
-    a, b = old.q_ref
-    new = msgspec.structs.replace(old, q_ref=(a, b + 10.0**-DECIMALS))
-    bent = edited(log, topics.JOINT_COMMAND, "hip_left", lambda row: new if row is old else row)
+    statuses: list[PlannerStatus] = log.messages(topics.PLANNER_STATUS)
+    old = statuses[len(statuses) // 2]
+    commands = list(old.commands)
+    a, b = commands[5].q_ref
+    commands[5] = msgspec.structs.replace(commands[5], q_ref=(a, b + 10.0**-POSITION))
+    new = msgspec.structs.replace(old, commands=tuple(commands))
+    bent = edited(log, topics.PLANNER_STATUS, "", lambda row: new if row is old else row)
     first = executed(bent, "hip_left").comparison.first
     assert first is not None
     assert old.t_ns <= first.t_ns <= old.t_ns + 200_000_000

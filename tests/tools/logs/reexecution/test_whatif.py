@@ -67,7 +67,7 @@ def test_a_lasting_fault_that_began_before_the_moment_goes_on_for_the_rest_of_it
 def test_moments_are_as_far_apart_as_asked_and_have_everybody_in_them(
     moments: list[Moment],
 ) -> None:
-    assert [round(moment.at_s, 1) for moment in moments] == [0.1, 0.5, 1.0, 1.5, 2.0]
+    assert [round(moment.at_s, 1) for moment in moments] == [0.2, 0.6, 1.0, 1.6, 2.0]
     assert all(len(moment.modules) == 6 for moment in moments)
     assert all(moment.planner is not None for moment in moments)
     assert all(moment.margin is not None and moment.margin > 0.5 for moment in moments)
