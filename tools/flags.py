@@ -362,7 +362,7 @@ class ConfigFlags(Flags):
     )
 
 
-def robot_file_of(before: str) -> Arg:
+def _robot_file_of(before: str) -> Arg:
     """Return the flag for a robot file, with `before` ahead of the usual defaults.
 
     The field is None if the flag is not given; the verb then calls `places.robot_file` itself.
@@ -374,7 +374,7 @@ def robot_file_of(before: str) -> Arg:
 class FleetRobotFlags(RunDirFlags):
     """Fleet and robot file; by default the robot file of the running fleet, if there is one."""
 
-    config: Annotated[Path | None, robot_file_of("the fleet's")] = None
+    config: Annotated[Path | None, _robot_file_of("the fleet's")] = None
 
 
 class MotionFlags(FleetRobotFlags):

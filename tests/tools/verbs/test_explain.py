@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from shared.bus import topics
-from shared.bus.messages import PlannerStatus
+from shared.bus.messages import JointState, PlannerStatus
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import JOINTS, MODULES, N_JOINTS
+from tests.tools.logs.reexecution.executions import edited
 from tools import cli
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.torque_breakdown import torque_breakdown
@@ -108,6 +110,31 @@ def test_a_time_without_ticks_names_the_times_with_some(
 ) -> None:
     assert cli.main(["log", "explain", str(log.path), "--at", "60"]) == 2
     assert re.search(r"within the planner's ticks, -?\d", capsys.readouterr().err)
+
+
+def test_a_tick_with_a_missing_state_names_the_nearest_complete_one(log: RunLog) -> None:
+    zero = zero_ns(log.index)
+    lost = explain.tick_at(log, 0.9, zero)
+    lacking = edited(
+        log, topics.JOINT_STATE, MODULES[2], lambda row: None if row == lost.states[2] else row
+    )
+    with pytest.raises(RunError, match=r"the nearest complete tick is at 0\.(89|90)\d s") as error:
+        explain.tick_at(lacking, 0.9, zero)
+    (nearest,) = re.findall(r"nearest complete tick is at (\S+) s", str(error.value))
+    assert explain.tick_at(lacking, float(nearest), zero).status.seq in (
+        lost.status.seq - 1, lost.status.seq + 1
+    )  # fmt: skip
+
+
+def test_a_state_of_a_restarted_module_with_the_same_number_is_not_taken(log: RunLog) -> None:
+    zero = zero_ns(log.index)
+    tick = explain.tick_at(log, 0.9, zero)
+    last: JointState = log.messages(topics.JOINT_STATE, MODULES[2])[-1]
+    again = msgspec.structs.replace(last, seq=tick.states[2].seq)
+    restarted = edited(
+        log, topics.JOINT_STATE, MODULES[2], lambda row: again if row is last else row
+    )
+    assert explain.tick_at(restarted, 0.9, zero).states == tick.states
 
 
 @settings(max_examples=20)

@@ -44,8 +44,8 @@ SECONDS: Final = 3.0
 """Recorded part of the squat, down and up, s."""
 PIECE_S: Final = 0.5
 """Virtual time of a lockstep run for one figure, s."""
-BATCH: Final = 64
-"""Messages per batch; the recorder takes about 80 in one cycle of 20 ms."""
+CHUNK: Final = 600
+"""Messages per chunk; the recorder writes one every 250 ms."""
 MODULE: Final = "knee_right"
 
 
@@ -112,7 +112,8 @@ def record(robot: RobotConfig, scenario: Scenario) -> Recorded:
     messages: list[tuple[Topic, str, Message]] = []
 
     def take(topic: Topic, module: str, message: Message) -> None:
-        messages.append((topic, module, message))
+        if topic.recorded:
+            messages.append((topic, module, message))
         if isinstance(message, JointState):
             latest[module] = message
         elif topic is topics.PLANNER_STATUS and len(latest) == len(MODULES):
@@ -220,16 +221,20 @@ def _simulator_step(recorded: Recorded, _stack: ExitStack) -> Repeated:
     return Repeated(once)
 
 
-def _recorder_batch(recorded: Recorded, stack: ExitStack) -> Repeated:
-    """Time writing `BATCH` messages to the file."""
+def _recorder_chunk(recorded: Recorded, stack: ExitStack) -> Repeated:
+    """Time writing `CHUNK` messages, compressed, to the file."""
     writer = _writer(recorded.robot, stack)
     outbox, messages = RecordedMessages(recorded.robot.name), itertools.cycle(recorded.messages)
 
     def before() -> None:
-        for topic, module, message in itertools.islice(messages, BATCH):
+        for topic, module, message in itertools.islice(messages, CHUNK):
             outbox.put(topic, module, message)
 
-    return Repeated(lambda: writer.take_from(outbox, BATCH), before)
+    def once() -> None:
+        writer.take_from(outbox, CHUNK)
+        writer.flush()
+
+    return Repeated(once, before)
 
 
 def yardstick(_recorded: Recorded, _stack: ExitStack) -> Repeated:
@@ -264,7 +269,7 @@ PARTS: Final = (
     Part("joint cycle", _joint_cycle),
     Part("joint's drive over CAN", _drive_exchange),
     Part("simulator step", _simulator_step),
-    Part(f"recorder, {BATCH} messages", _recorder_batch),
+    Part(f"recorder, {CHUNK} messages", _recorder_chunk),
     Part("yardstick", yardstick),
 )
 

@@ -25,7 +25,7 @@ M = TypeVar("M", bound=Message)
 _encode: Final = msgspec.json.Encoder().encode
 
 
-class _BySeq(Generic[M]):
+class BySeq(Generic[M]):
     """Finds a sender's message by its sequence number, which restarts with the sender."""
 
     def __init__(self, messages: Iterable[M]) -> None:
@@ -120,9 +120,9 @@ class PlannerExecution:
         self._log_robot = log.robot
         snapshots: list[PlannerCheckpoint] = log.messages(topics.PLANNER_CHECKPOINT)
         self._snapshots = {(snapshot.session, snapshot.t_ns): snapshot for snapshot in snapshots}
-        self._states = [_BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
-        self._wrenches = _BySeq(log.messages(topics.WRENCH))
-        self._attitudes = _BySeq(log.messages(topics.ATTITUDE))
+        self._states = [BySeq(log.messages(topics.JOINT_STATE, name)) for name in MODULES]
+        self._wrenches = BySeq(log.messages(topics.WRENCH))
+        self._attitudes = BySeq(log.messages(topics.ATTITUDE))
 
     def snapshot(self) -> tuple[int, PlannerState] | None:
         """Return the planner's session and present state, or None if it cannot be executed."""

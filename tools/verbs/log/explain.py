@@ -24,15 +24,16 @@ from shared.bus.messages import (
     Trip,
     name_of,
 )
-from shared.clock import NS_PER_MS
+from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
-from shared.joints import JOINTS, MODULES
+from shared.joints import JOINTS, MODULES, N_MODULES
 from tools.flags import Arg, Flags, Number, Run
 from tools.judge.run_parts import zero_ns
 from tools.lab.design.push_limit import PushLimits
 from tools.lab.design.torque_breakdown import TorqueBreakdown, torque_breakdown
 from tools.logs.impairment_intervals import impairments
+from tools.logs.reexecution.planner import BySeq
 from tools.logs.run_index import RunIndex
 from tools.logs.run_log import RunLog, RunPart, refuse_own_controller, robot_of
 from tools.terminal import Console, marked
@@ -55,7 +56,7 @@ class Tick(NamedTuple):
     """Tick as recorded in the log."""
 
     status: PlannerStatus
-    commands: list[JointCommand]
+    commands: Sequence[JointCommand]
     states: list[JointState]
     """States that the tick used."""
 
@@ -127,27 +128,37 @@ def tick_at(log: RunLog, at_s: float | None, zero_ns: int) -> Tick:
                 f"--at {at_s:g}: must be within the planner's ticks, {first:.2f} to {last:.2f} s"
             )
     status = led[index]
-    commands, states = [], []
-    for number, module in enumerate(MODULES):
-        command = _find(log.messages(topics.JOINT_COMMAND, module), status.seq, status.session)
-        state = _find(log.messages(topics.JOINT_STATE, module), status.state_seq[number])
-        if command is None or state is None:
-            raise RunError(
-                f"{log.path}: {module}: the command or state of tick {status.seq} is missing; "
-                "choose another --at"
-            )
-        commands.append(command)
-        states.append(state)
-    return Tick(status, commands, states)
+    sent = [BySeq[JointState](log.messages(topics.JOINT_STATE, module)) for module in MODULES]
+    tick = _complete(status, sent)
+    if tick is None:
+        nearest = min(
+            (row.t_ns for row in led if _complete(row, sent) is not None),
+            key=lambda t_ns: abs(t_ns - status.t_ns),
+            default=None,
+        )
+        if nearest is None:
+            raise RunError(f"{log.path}: contains no tick with all commands and states")
+        raise RunError(
+            f"{log.path}: a command or a state of the tick at {_seconds(status.t_ns, zero_ns)} is "
+            f"missing; the nearest complete tick is at {_seconds(nearest, zero_ns)}"
+        )
+    return tick
 
 
-def _find(messages: list[Any], seq: int, session: int | None = None) -> Any:
-    """Return the newest message with a sequence number, or None."""
-    found = (row for row in reversed(messages) if row.seq == seq)
-    return next((row for row in found if session is None or row.session == session), None)
+def _complete(status: PlannerStatus, sent: Sequence[BySeq[JointState]]) -> Tick | None:
+    """Return a tick with the states that it used; None if the log lacks a part of it."""
+    found = (one.at(seq, status.t_ns) for one, seq in zip(sent, status.state_seq, strict=True))
+    states = [state for state in found if state is not None]
+    if len(states) < N_MODULES or len(status.commands) < N_MODULES:
+        return None
+    return Tick(status, status.commands, states)
 
 
-def _joined(messages: list[Any], name: str) -> Array:
+def _seconds(t_ns: int, zero_ns: int) -> str:
+    return f"{(t_ns - zero_ns) / NS_PER_S:.3f} s"
+
+
+def _joined(messages: Sequence[Any], name: str) -> Array:
     return np.array([getattr(message, name) for message in messages], dtype=float).ravel()
 
 

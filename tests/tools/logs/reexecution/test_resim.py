@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import pickle
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -28,13 +26,13 @@ from tests.imu.robots import with_imu
 from tests.lockstep.runs import still
 from tests.shared.mcap_log.runs import recorded_in_parts, state
 from tests.tools.exit_codes import exit_code
-from tests.tools.logs.reexecution.executions import executed
+from tests.tools.logs.reexecution.executions import edited, executed
 from tools import cli
 from tools.logs.reexecution import execution
 from tools.logs.reexecution.compare import ReexecutionResult
 from tools.logs.reexecution.execution import RangeTask, execute_range, merged, ranges_of
 from tools.logs.reexecution.params import with_params
-from tools.logs.run_log import WHOLE, RunLog, RunPart, Series, parts_of, read_run
+from tools.logs.run_log import WHOLE, RunLog, RunPart, parts_of, read_run
 from tools.sim.recorded_lockstep import simulate
 from tools.verbs.log import resim
 
@@ -70,18 +68,6 @@ def log(recorded: Path) -> RunLog:
 def whole(log: RunLog) -> Callable[[str], ReexecutionResult]:
     """Return what comes of a service over the whole run; each is executed once."""
     return functools.cache(lambda name: executed(log, name))
-
-
-def edited(log: RunLog, topic: Topic, module: str, change: Callable[[Any], Any]) -> RunLog:
-    """Return a copy of a log with messages of one key changed, or left out where that is None."""
-    messages, received = log.messages(topic, module), log.received_ns(topic, module)
-    rows = zip(map(change, messages), received, strict=True)
-    kept = [(message, at_ns) for message, at_ns in rows if message is not None]
-    series = Series()
-    series.decoded, series.received_ns = [row[0] for row in kept], [row[1] for row in kept]
-    copied = copy.copy(log)
-    copied._series = log._series | {topic.key(log.robot, module): series}
-    return copied
 
 
 @pytest.mark.parametrize("name", ["planner", "knee_left"])
