@@ -1,7 +1,7 @@
 """Rounding of measured and computed numbers, so that messages are short. Pure.
 
-Each constant is a number of decimals, finer than any sensor or motor here resolves: an encoder
-counts 6e-5 turns of its motor, which are 2e-5 rad at the joint.
+Each constant is a number of decimals. An encoder counts 6e-5 turns of its motor, which move the
+joint by 1e-5 rad.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ POSITION: Final = 5
 RATE: Final = 4
 """Decimals of their rates, m/s, rad/s and turn/s."""
 FORCE: Final = 3
-"""Decimals of forces, torques, gains and loads, N, N m, N m/rad and kg."""
+"""Decimals of forces, torques, gains, loads and voltages, N, N m, N m/rad, kg and V."""
 _PER_UNIT: Final = tuple(10.0**decimals for decimals in range(TURNS + 1))
 
 

@@ -439,7 +439,7 @@ class Planner:
     def _commands(self, inputs: Inputs, output: LawOutput) -> list[JointCommand]:
         """Return the tick's six commands; each echoes the stamp of its module's state."""
         s, local, hold = self.state, output.local, self._hold()
-        margin, margin_onboard = rounded(local.margins, RATE)
+        margin, margin_onboard = _rounded_down(local.margins)
         arrays = (
             output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
             local.D, local.D_B,
@@ -539,7 +539,7 @@ class Planner:
         if output is not None:
             vectors = output.p, output.pdot, output.p_ref, output.closure, np.array(output.stance)
             p, pdot, p_ref, closure, stance = map(vector6, _rounded(vectors, _OF_STATUS))
-            margin, margin_onboard = rounded(output.local.margins, RATE)
+            margin, margin_onboard = _rounded_down(output.local.margins)
         return PlannerStatus(
             t_ns=now_ns,
             seq=s.seq,
@@ -587,6 +587,12 @@ def _rounded(vectors: Sequence[Array], decimals: tuple[int, ...]) -> Array:
     rows: Array = np.concatenate(vectors).reshape(len(vectors), -1)
     per_unit = _per_unit(decimals)
     return np.divide(np.rint(np.multiply(rows, per_unit, rows), rows), per_unit, rows)
+
+
+def _rounded_down(margins: tuple[float, float]) -> tuple[float, float]:
+    """Return margins with four decimals, never larger than they are."""
+    service, onboard = margins
+    return service * 1e4 // 1.0 / 1e4, onboard * 1e4 // 1.0 / 1e4
 
 
 @cache

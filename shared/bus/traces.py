@@ -12,6 +12,7 @@ from typing import Final
 import msgspec
 
 from shared.bus.messages import Int64, Message, Pair, Vector3
+from shared.exceptions import RunError
 
 Ints = tuple[Int64, ...]
 Floats = tuple[float, ...]
@@ -53,7 +54,7 @@ class CycleColumns(msgspec.Struct, gc=False, frozen=True):
     """
 
     now_ns: Ints
-    """Time since the previous cycle; the first is 0. In a row: the time."""
+    """Time of the first cycle, then the time since the previous one. In a row: the time."""
     sampled_ns: Ints
     """Age of the drive's sample; -1: none, and the next six fields are invalid. In a row: the time
     of its arrival."""
@@ -118,7 +119,7 @@ class JointTrace(Message, frozen=True):
         for name in _PAIRS:
             columns[name] = tuple(chain.from_iterable(columns[name]))
         now_ns, sampled_ns = columns["now_ns"], columns["sampled_ns"]
-        columns["now_ns"] = (0, *(b - a for a, b in pairwise(now_ns)))
+        columns["now_ns"] = (now_ns[0], *(b - a for a, b in pairwise(now_ns)))
         columns["sampled_ns"] = tuple(
             now - sampled if sampled >= 0 else -1
             for now, sampled in zip(now_ns, sampled_ns, strict=True)
@@ -127,19 +128,23 @@ class JointTrace(Message, frozen=True):
 
     @property
     def cycles(self) -> list[CycleTrace]:
-        """The cycles, oldest first."""
+        """The cycles, oldest first; raises RunError if the columns differ in length."""
         columns = msgspec.structs.asdict(self.columns)
-        for name in _PAIRS:
-            column = columns[name]
-            columns[name] = zip(column[::2], column[1::2], strict=True)
-        steps_ns = columns["now_ns"]
-        now_ns = tuple(accumulate(steps_ns, initial=self.t_ns - sum(steps_ns)))[1:]
-        columns["now_ns"] = now_ns
-        columns["sampled_ns"] = tuple(
-            now - age if age != -1 else -1
-            for now, age in zip(now_ns, columns["sampled_ns"], strict=True)
-        )
-        return [CycleTrace(*row) for row in zip(*columns.values(), strict=True)]
+        try:
+            for name in _PAIRS:
+                column = columns[name]
+                columns[name] = zip(column[::2], column[1::2], strict=True)
+            columns["now_ns"] = now_ns = tuple(accumulate(columns["now_ns"]))
+            columns["sampled_ns"] = tuple(
+                now - age if age != -1 else -1
+                for now, age in zip(now_ns, columns["sampled_ns"], strict=True)
+            )
+            return [CycleTrace(*row) for row in zip(*columns.values(), strict=True)]
+        except ValueError:
+            raise RunError(
+                f"trace {self.seq}, at {self.t_ns} ns: its columns must have one entry for each "
+                "cycle, those of pairs two; the record is damaged"
+            ) from None
 
 
 class PlannerCheckpoint(Message, frozen=True):

@@ -378,8 +378,8 @@ class LogReader:
             if not (self._is_sound(content, row) and first_ns <= row.log_ns <= end_ns):
                 break
             good.append(row)
-        last_ns = good[-1].log_ns if good else first_ns
-        self.cut = LostBytes(at, self.size, last_ns, end_ns)
+        # messages are not always in the order of their times: ours are grouped by key
+        self.cut = LostBytes(at, self.size, first_ns, end_ns)
         return LogRecord(Opcode.CHUNK, at, self.size, content, chunk, good, definitions, self.cut)
 
     def _is_sound(self, content: bytes, row: ChunkMessage) -> bool:

@@ -7,10 +7,11 @@ end metadata `counts` (of this file) and the summary. The mcap package writes sc
 again in the first chunk: if one copy is damaged, the other remains.
 
 Time: `log_time` is the time at which the recorder read a message from its queue (at most one drain
-period after its arrival), `publish_time` the message's own `t_ns`. Both come from monotonic clocks.
-One offset, measured at the start and written as `offset_ns` into metadata `clock`, maps them to ns
-since 1970 so that viewers show dates: wall = monotonic + offset_ns. It is the recorder's offset, so
-`publish_time` is meaningful only for senders on the recorder's host.
+period after its arrival), rounded up to a millisecond; `publish_time` is the message's own `t_ns`.
+Both come from monotonic clocks. One offset, measured at the start and written as `offset_ns` into
+metadata `clock`, maps them to ns since 1970 so that viewers show dates: wall = monotonic +
+offset_ns. It is the recorder's offset, so `publish_time` is meaningful only for senders on the
+recorder's host.
 
 A file whose writer was killed has no summary: `shared/mcap_log/recover.py` adds one, and
 `tools/logs/run_log.py` can read the file without it. A file is locked while it is written.

@@ -45,15 +45,15 @@ class CompiledGraph:
         self.arguments = [_room(function.size_in(i)) for i in range(function.n_in())]
         self.results = [_room(function.size_out(i)) for i in range(function.n_out())]
         for index, array in enumerate(self.arguments):
-            buffer.set_arg(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
+            buffer.set_arg(index, array.T.reshape(-1).data)  # type: ignore[call-arg]  # casadi's stub
         for index, array in enumerate(self.results):
-            buffer.set_res(index, memoryview(array.T.reshape(-1)))  # type: ignore[call-arg, arg-type]  # casadi's stub
+            buffer.set_res(index, array.T.reshape(-1).data)  # type: ignore[call-arg]  # casadi's stub
 
     def bind(self, index: int, array: Array) -> None:
         """Read an argument from a caller's contiguous array (n,), which must outlive this graph."""
         assert array.shape == self.arguments[index].shape  # noqa: S101 - else it reads beyond
         self.arguments[index] = array
-        self._buffer.set_arg(index, memoryview(array))  # type: ignore[call-arg, arg-type]  # casadi's stub
+        self._buffer.set_arg(index, array.data)  # type: ignore[call-arg]  # casadi's stub
 
     def __call__(self) -> None:
         """Compute the results from the arguments."""

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from shared.bus.codec import Decoder, encode
 from shared.bus.messages import JointCommand, Message
 from shared.bus.topics import JOINT_STATE, TOPICS, WRENCH, Topic, all_keys, keys
-from shared.bus.traces import Batch
+from shared.bus.traces import Batch, CycleTrace, JointTrace
 from shared.config import endpoints
 from shared.config.endpoints import host_and_port, is_endpoint, stray_braces
 from shared.config.robot_config import expand
-from shared.exceptions import BusError, NonFiniteError
+from shared.exceptions import BusError, NonFiniteError, RunError
 from shared.joints import MODULES
 from shared.run_directory import live_dir
 from tests.messages import filled
@@ -195,3 +195,32 @@ def test_braces_that_nothing_is_filled_into_are_found_and_refused(text: str, str
 def test_a_socket_path_that_the_bus_would_take_apart_is_no_endpoint(path: str) -> None:
     assert not is_endpoint(f"unixsock-stream/{path}")
     assert is_endpoint(f"unixsock-stream/{re.sub('[?#]', '', path)} 50% ;")
+
+
+def _at(cycle: CycleTrace, number: int) -> CycleTrace:
+    """Return a cycle at its time; every third one has no sample."""
+    now_ns = 10**15 + 2_000_123 * number
+    sampled_ns = -1 if number % 3 == 2 else now_ns - 1_000 * number
+    return msgspec.structs.replace(cycle, now_ns=now_ns, sampled_ns=sampled_ns)
+
+
+@given(st.lists(messages_of(CycleTrace), min_size=1, max_size=10))
+def test_cycles_come_back_from_their_columns_bit_by_bit(rows: list[CycleTrace]) -> None:
+    cycles = [_at(row, number) for number, row in enumerate(rows)]
+    trace = JointTrace.of(cycles, seq=3, snapshot="{}")
+    found = Decoder(JointTrace).decode(encode(trace))
+    assert found is not None
+    assert found.t_ns == cycles[-1].now_ns
+    assert encode(found.cycles) == encode(cycles)
+
+
+@pytest.mark.parametrize("column", [{"pos": (1.0,)}, {"estop": ()}, {"now_ns": (1, 2)}])
+def test_columns_of_different_lengths_are_an_error_in_words(column: dict[str, Any]) -> None:
+    trace = JointTrace.of([filled(CycleTrace, {bool: True, int: 5, float: 1.0})], 7, "")
+    damaged = msgspec.structs.replace(
+        trace, columns=msgspec.structs.replace(trace.columns, **column)
+    )
+    with pytest.raises(
+        RunError, match="trace 7, at 5 ns: its columns must have one entry"
+    ):
+        _ = damaged.cycles

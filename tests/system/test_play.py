@@ -16,7 +16,7 @@ from typing import NamedTuple
 import pytest
 
 from shared.bus import codec, topics
-from shared.bus.messages import Estop, JointCommand, JointState, Message, Wrench
+from shared.bus.messages import Estop, JointState, Message, Wrench
 from shared.bus.session import Session, open_session
 from shared.bus.traces import SimTruth
 from shared.config import files as config_file
@@ -35,10 +35,9 @@ BEGAN = 5_000_000_000
 STATE = topics.JOINT_STATE.key(NAME, "knee_left")
 WRENCH = topics.WRENCH.key(NAME)
 TRUTH = topics.SIM_TRUTH.key(NAME)
-COMMAND = topics.JOINT_COMMAND.key(NAME, "knee_left")
 STOP = topics.ESTOP.key(NAME)
 KINDS: dict[str, type[Message]] = {
-    STATE: JointState, WRENCH: Wrench, TRUTH: SimTruth, COMMAND: JointCommand, STOP: Estop,
+    STATE: JointState, WRENCH: Wrench, TRUTH: SimTruth, STOP: Estop,
 }  # fmt: skip
 
 Item = tuple[str, bytes, int]
@@ -133,7 +132,7 @@ def listening(run_dir: Path, expression: str = "replay/**") -> Iterator[Ear]:
 def test_a_subscriber_gets_every_message_in_the_recorded_order_byte_for_byte(
     run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also as fast as it can. Commands and stops too are under no key but one below `replay/`."""
+    """Also as fast as it can. Stops too are under no key but one below `replay/`."""
     rows = items(30.0, *KINDS)
     log = write(tmp_path / "log", rows, monkeypatch, parts=3)
     words = (log, "--rate", "1000", "--wait", "60")
@@ -141,7 +140,7 @@ def test_a_subscriber_gets_every_message_in_the_recorded_order_byte_for_byte(
         assert ear.all(process) == [(f"replay/{key}", payload) for key, payload, _ in rows]
         done = ended(process)
     assert done.code == 0, done.out
-    assert f"{len(rows)} messages on 5 keys" in done.out
+    assert f"{len(rows)} messages on 4 keys" in done.out
     assert "all sent" in done.out
     assert not list(run_dir.glob("*")), "the player's socket is gone"
 

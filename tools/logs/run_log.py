@@ -23,7 +23,7 @@ import msgspec
 
 from services.planner.controller import ATTACHED
 from shared.bus import topics
-from shared.bus.messages import PlannerStatus
+from shared.bus.messages import JointCommand, PlannerStatus
 from shared.bus.topics import Topic
 from shared.clock import NS_PER_MS, NS_PER_S
 from shared.config import files as config_file
@@ -154,7 +154,7 @@ class RunLog:
         """
         key = self._key(topic, module)
         if topic is topics.JOINT_COMMAND:
-            return [status.commands[MODULE_INDEX[module]] for _, status in self._commanding()]
+            return [commands[MODULE_INDEX[module]] for _, commands in self._commands()]
         series = self._of(key)
         if series.decoded is None:
             decode = msgspec.json.Decoder(topic.type).decode
@@ -188,7 +188,7 @@ class RunLog:
         The times are on the monotonic clock of the recorder's host.
         """
         if topic is topics.JOINT_COMMAND:
-            return [at_ns for at_ns, _ in self._commanding()]
+            return [at_ns for at_ns, _ in self._commands()]
         return self._of(self._key(topic, module)).received_ns
 
     def holds(self, received_ns: int) -> bool:
@@ -237,12 +237,15 @@ class RunLog:
             for message, t_ns in zip(messages, times_ns, strict=True)
         ]
 
-    def _commanding(self) -> list[tuple[int, PlannerStatus]]:
-        """Return the statuses that contain commands, each with the time of its reception."""
+    def _commands(self) -> list[tuple[int, list[JointCommand]]]:
+        """Return each tick's commands, with the stamp of their status and its reception."""
         statuses: list[PlannerStatus] = self.messages(topics.PLANNER_STATUS)
         received = self.received_ns(topics.PLANNER_STATUS)
-        rows = zip(received, statuses, strict=True)
-        return [row for row in rows if len(row[1].commands) == N_MODULES]
+        return [
+            (at_ns, [msgspec.structs.replace(row, t_ns=status.t_ns) for row in status.commands])
+            for at_ns, status in zip(received, statuses, strict=True)
+            if len(status.commands) == N_MODULES
+        ]
 
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):

@@ -51,9 +51,9 @@ def test_the_messages_before_the_cut_in_a_chunk_come_back(tmp_path: Path) -> Non
     assert 500 < len(found) < 3000
     assert found == list(range(len(found)))
     assert outcome.cut is not None
-    # the chunk's head says when it ends: 1 ms per message
+    # some messages of any time within the chunk may be missing: they are grouped by key
     lost_s = (outcome.cut.last_ns - outcome.cut.first_ns) / 1e9
-    assert lost_s == pytest.approx((3000 - len(found)) * 1e-3, abs=2e-3)
+    assert lost_s == pytest.approx(2.999, abs=2e-3)
     assert f"{lost_s:.3f} s" in "\n".join(recover.describe(outcome))
 
 

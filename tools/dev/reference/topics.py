@@ -10,6 +10,7 @@ import msgspec
 
 from shared.bus import messages, topics
 from shared.bus.topics import Topic
+from shared.bus.traces import Batch
 from shared.joints import MODULES
 from shared.mcap_log.schema import ENUMERATIONS
 from tools.dev.reference.markdown import cell_docs, one_line, summary, table
@@ -23,8 +24,8 @@ _INTRODUCTION: Final = """\
 
 A topic's key is `xrl/<robot>/<topic>`; `*` stands for a module. Payloads are JSON in SI units; a
 suffix such as `_ms` or `_n` (newtons) names the unit. Enumerations are integers. Rates are nominal.
-`operator` is any tool that may write. The recorder and tools may read every topic; all are
-recorded.
+`operator` is any tool that may write. The recorder and tools may read every topic; all
+messages are recorded.
 """
 
 
@@ -57,7 +58,7 @@ def _topic_row(topic: Topic) -> tuple[str, ...]:
         topic.priority.name.lower().replace("_", " "),
         _names(topic.writers),
         _names(topic.readers),
-        f"{one_line(topic.why)}{'' if topic.recorded else ' (recorded unpacked)'}",
+        f"{one_line(topic.why)}{' (recorded unpacked)' if topic.type is Batch else ''}",
     )
 
 

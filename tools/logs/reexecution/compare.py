@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping
+from decimal import Decimal
 from typing import Any, Final, TypeAlias, TypeVar
 
 import msgspec
@@ -15,6 +16,7 @@ import msgspec
 from shared.bus.messages import Message
 from shared.exceptions import RunError
 from shared.revision import UNKNOWN
+from shared.rounding import FORCE, TURNS
 
 State = TypeVar("State")
 
@@ -186,10 +188,22 @@ def _ordered(value: float) -> int:
 
 def _near(a: Any, b: Any, tolerance: float) -> bool:
     if _is_number(a) and _is_number(b) and tolerance > 0.0:
-        return bool(abs(b - a) <= tolerance)
+        return bool(abs(b - a) <= max(tolerance, 1.5 * _unit(a, b)))
     if isinstance(a, float) and isinstance(b, float):
         return a == b and math.copysign(1.0, a) == math.copysign(1.0, b)
     return bool(a == b)
+
+
+def _unit(a: float, b: float) -> float:
+    """Return one unit of the last decimal of two rounded numbers (`shared.rounding`), else 0.
+
+    Another machine's last bit can round a number the other way.
+    """
+    if isinstance(a, int) or isinstance(b, int):
+        return 0.0
+    exponents = [Decimal(repr(number)).as_tuple().exponent for number in (a, b)]
+    most = max((-each for each in exponents if isinstance(each, int)), default=0)  # NaN has no exponent
+    return 0.0 if most > TURNS else 10.0 ** -max(most, FORCE)
 
 
 def _is_number(value: Any) -> bool:
@@ -235,7 +249,7 @@ def likely_reason(recorded: Origin, here: Origin) -> str:
     if differing:
         line = f"likely reason: recorded with {'; '.join(differing)}"
         if not all(each.startswith("code ") for each in differing):
-            line += "; `--tolerance 2e-3` accepts what another machine rounds differently"
+            line += "; `--tolerance 1e-9` accepts what another machine rounds differently"
     else:
         line = f"no reason known: {'no known fact differs' if untold else 'the same environment'}"
     return f"{line} (unknown: {', '.join(untold)})" if untold else line

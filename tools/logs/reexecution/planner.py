@@ -186,13 +186,14 @@ class PlannerExecution:
         outcome.ticks += 1
         (computed,) = tick.status.messages
         tick.status.messages.clear()
-        for name, recorded, command in zip(
-            MODULES, status.commands, computed.commands, strict=False
-        ):
-            compare(f"joint/{name}/command", status.seq, recorded, command)
         # tick_us is a measured time
-        alone = msgspec.structs.replace(computed, tick_us=status.tick_us, commands=())
-        compare("planner/status", status.seq, msgspec.structs.replace(status, commands=()), alone)
+        recorded = status
+        mine = msgspec.structs.replace(computed, tick_us=status.tick_us)
+        if len(status.commands) == len(computed.commands) == len(MODULES):
+            for name, *commands in zip(MODULES, status.commands, computed.commands, strict=True):
+                compare(f"joint/{name}/command", status.seq, *commands)
+            recorded, mine = (msgspec.structs.replace(row, commands=()) for row in (status, mine))
+        compare("planner/status", status.seq, recorded, mine)
         yield topics.PLANNER_STATUS.key(self._log_robot), computed
         snapshot = self._snapshots.get((status.session, status.t_ns))
         if snapshot is not None and outcome.exact:

@@ -24,7 +24,7 @@ from shared.bus.messages import (
     Trip,
     name_of,
 )
-from shared.clock import NS_PER_MS, NS_PER_S
+from shared.clock import NS_PER_MS
 from shared.config.robot_config import RobotConfig
 from shared.exceptions import RunError
 from shared.joints import JOINTS, MODULES, N_MODULES
@@ -155,7 +155,8 @@ def _complete(status: PlannerStatus, sent: Sequence[BySeq[JointState]]) -> Tick 
 
 
 def _seconds(t_ns: int, zero_ns: int) -> str:
-    return f"{(t_ns - zero_ns) / NS_PER_S:.3f} s"
+    """Return a time in ms, rounded up, so that the last tick until then is the one meant."""
+    return f"{-((zero_ns - t_ns) // NS_PER_MS) / 1e3:.3f} s"
 
 
 def _joined(messages: Sequence[Any], name: str) -> Array:

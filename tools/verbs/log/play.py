@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from operator import attrgetter
+from operator import itemgetter
 from typing import Annotated, Final, NamedTuple, Protocol
 
 import msgspec
@@ -88,7 +88,7 @@ def entries(index: RunIndex, part: RunPart, keys: Collection[str]) -> Iterator[E
     if part.end_s < index.length_s:
         end_ns = index.began_ns + math.ceil(part.end_s * NS_PER_S)
     for record, known in index.records(begin_ns, end_ns, frozenset(keys)):
-        for channel, _, log_ns, _, start, end in sorted(record.rows, key=attrgetter("log_ns")):
+        for channel, _, log_ns, _, start, end in sorted(record.rows, key=itemgetter(2, 3)):
             key = known.get(channel, "")
             if key in keys and begin_ns <= log_ns < end_ns:
                 yield Entry(log_ns - begin_ns, key, record.body[start:end])

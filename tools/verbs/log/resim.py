@@ -35,7 +35,7 @@ xrl log resim out/a/run.mcap
 xrl log resim out/a/run.mcap --service knee_left
 xrl log resim out/a/run.mcap --service planner --param law.K_p.x=2000
 xrl log resim out/a/run.mcap --service planner --controller mine.py   # what would it have sent?
-xrl log resim out/a/run.mcap --tolerance 2e-3             # recorded on another type of machine
+xrl log resim out/a/run.mcap --tolerance 1e-9             # recorded on another type of machine
 """
 
 

@@ -43,7 +43,7 @@ WIDTH: Final = 72
 
 EXAMPLES: Final = """
 xrl log whatif out/a/run.mcap --kill planner
-xrl log whatif out/a/run.mcap --kill planner --kill knee_left --every 0.5 --for 6
+xrl log whatif out/a/run.mcap --kill planner --kill knee_left --every 0.6 --for 6
 """
 
 
@@ -60,7 +60,7 @@ class WhatIfFlags(PartFlags):
         ),
     ]
     every: Annotated[float, Range(STATE_EVERY_S, FINITE_MAX, "s"), Arg(metavar="S")] = 0.2
-    """time between two kills; at least 0.2 s, the period of the recorded states"""
+    """time between two kills, to within 0.1 s; at least 0.2 s, the period of the recorded states"""
     for_s: Annotated[Duration, option("--for", metavar="S")] = 4.0
     """duration of each continued run, with pushes and hand as recorded"""
     workers: Annotated[Count | None, Arg(metavar="N")] = None

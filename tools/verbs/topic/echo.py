@@ -122,6 +122,11 @@ def shown(message: Message, name: str, value: Any) -> str:
             return f"{value}, which is not a valid {kind.__name__}"
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, Message):
+        fields = msgspec.structs.asdict(value).items()
+        return " ".join(f"{name} {shown(value, name, part)}" for name, part in fields)
+    if isinstance(value, tuple) and value and isinstance(value[0], Message):
+        return "".join(f"\n    {shown(message, '', part)}" for part in value)
     if isinstance(value, tuple):
         return "[" + ", ".join(shown(message, "", part) for part in value) + "]"
     return str(value)

@@ -68,6 +68,26 @@ def test_a_tolerance_is_for_numbers(apart: float, agrees: bool) -> None:
     assert not comparison.take("k", 1, event(), event(cause=3))
 
 
+@pytest.mark.parametrize(
+    ("one", "other", "agrees"),
+    [
+        (0.12345, 0.12346, True),
+        (0.12345, 0.12347, False),
+        (20.0, 20.001, True),
+        (20.0, 20.002, False),
+        (1.0, 0.9, False),
+        (0.123456789, 0.12345678, False),
+        (1e-05, 0.0, True),
+        (math.nan, 1.0, False),
+    ],
+)
+def test_with_a_tolerance_one_unit_of_the_last_decimal_may_differ(
+    one: float, other: float, agrees: bool
+) -> None:
+    assert Comparison(1e-12).take("k", 1, event(one), event(other)) is agrees
+    assert not Comparison().take("k", 1, event(one), event(other))
+
+
 def test_first_and_largest_are_kept() -> None:
     comparison = Comparison()
     for tick, change in enumerate((1e-3, 5.0, 2.0)):
@@ -139,7 +159,7 @@ def test_all_that_differs_is_told_in_one_line() -> None:
     found = likely_reason(origin(architecture="aarch64", numpy="2.3"), origin())
     assert found == (
         "likely reason: recorded with architecture aarch64, here x86_64; numpy 2.3, here 2.4; "
-        "`--tolerance 2e-3` accepts what another machine rounds differently"
+        "`--tolerance 1e-9` accepts what another machine rounds differently"
     )
 
 
