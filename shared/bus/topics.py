@@ -68,10 +68,6 @@ JOINT_BATCH: Final = Topic(
     "joint/*/batch", traces.Batch, 50.0, _DATA, ("*",), (),
     "states, events and traces, for the recorder", recorded=False,
 )  # fmt: skip
-PLANNER_BATCH: Final = Topic(
-    "planner/batch", traces.Batch, 250.0, _DATA, ("planner",), (),
-    "status and checkpoints, for the recorder", recorded=False,
-)  # fmt: skip
 JOINT_STATE: Final = Topic(
     "joint/*/state", messages.JointState, 250.0, _REAL_TIME, ("*",), ("planner",),
     "measured state", batch=JOINT_BATCH,
@@ -103,12 +99,11 @@ HARNESS_TARE: Final = Topic(
 )  # fmt: skip
 PLANNER_STATUS: Final = Topic(
     "planner/status", messages.PlannerStatus, 250.0, _DATA, ("planner",), (),
-    "inputs and decisions of the law", batch=PLANNER_BATCH, closes=True,
+    "inputs, decisions and commands of the law",
 )  # fmt: skip
 PLANNER_CHECKPOINT: Final = Topic(
     "planner/checkpoint", traces.PlannerCheckpoint, 1.0, _BACKGROUND, ("planner",), (),
     "planner state, for re-execution; at start-up more often",
-    batch=PLANNER_BATCH,
 )  # fmt: skip
 OPERATOR_INTENT: Final = Topic(
     "operator/intent", messages.OperatorIntent, 50.0, _DATA, (OPERATOR, "simulator"),

@@ -32,7 +32,6 @@ TALK: dict[Topic, tuple[tuple[str, ...], tuple[str, ...]]] = {
     topics.JOINT_EVENT: (MODULES, ("recorder", TOOL)),
     topics.JOINT_TRACE: (MODULES, ("recorder",)),
     topics.JOINT_BATCH: (MODULES, ("recorder", TOOL)),
-    topics.PLANNER_BATCH: (("planner",), ("recorder", TOOL)),
     topics.PLANNER_CHECKPOINT: (("planner",), ("recorder",)),
     topics.SIM_STATE: (("simulator",), ("recorder",)),
     topics.WRENCH: (("harness",), ("planner", "recorder", TOOL)),

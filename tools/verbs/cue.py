@@ -81,7 +81,7 @@ class _Heard:
             module: session.latest_in_batch(topics.JOINT_STATE, JointState, module)
             for module in MODULES
         }
-        self._latest["planner"] = session.latest_in_batch(topics.PLANNER_STATUS, PlannerStatus)
+        self._latest["planner"] = session.latest(topics.PLANNER_STATUS, PlannerStatus)
         self._seen: dict[str, tuple[float, int]] = {}
 
     def look(self) -> Cue:

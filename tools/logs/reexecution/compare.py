@@ -202,7 +202,7 @@ def _unit(a: float, b: float) -> float:
     if isinstance(a, int) or isinstance(b, int):
         return 0.0
     exponents = [Decimal(repr(number)).as_tuple().exponent for number in (a, b)]
-    most = max((-each for each in exponents if isinstance(each, int)), default=0)  # NaN has no exponent
+    most = max((-each for each in exponents if isinstance(each, int)), default=0)
     return 0.0 if most > TURNS else 10.0 ** -max(most, FORCE)
 
 
