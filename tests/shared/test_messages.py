@@ -220,7 +220,5 @@ def test_columns_of_different_lengths_are_an_error_in_words(column: dict[str, An
     damaged = msgspec.structs.replace(
         trace, columns=msgspec.structs.replace(trace.columns, **column)
     )
-    with pytest.raises(
-        RunError, match="trace 7, at 5 ns: its columns must have one entry"
-    ):
+    with pytest.raises(RunError, match="trace 7, at 5 ns: its columns must have one entry"):
         _ = damaged.cycles
