@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import Final, NamedTuple
 
 import msgspec
@@ -30,7 +29,7 @@ from services.planner.watch.plausible import HarnessTrust, Plausible
 from services.planner.watch.reserves import HeatWatch, HeatWatchState, SupplyState, SupplyWatch
 from services.planner.watch.trips import PlannerTrips, TripsState, values_of
 from services.planner.watch.unattended import Unattended
-from shared.arrays import Array, vector6
+from shared.arrays import Array, rounded_rows, vector6
 from shared.bus.messages import (
     Attitude,
     JointCommand,
@@ -444,7 +443,7 @@ class Planner:
             output.q_ref, output.v_ref, output.tau_ff, output.dtau_ff, output.tau_coupled,
             local.D, local.D_B,
         )  # fmt: skip
-        rows = _rounded(arrays, _OF_COMMANDS).tolist()
+        rows = rounded_rows(arrays, _OF_COMMANDS).tolist()
         pairs = [list(zip(row[::2], row[1::2], strict=True)) for row in rows]
         return [
             JointCommand(
@@ -538,7 +537,7 @@ class Planner:
         p = pdot = p_ref = closure = stance = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         if output is not None:
             vectors = output.p, output.pdot, output.p_ref, output.closure, np.array(output.stance)
-            p, pdot, p_ref, closure, stance = map(vector6, _rounded(vectors, _OF_STATUS))
+            p, pdot, p_ref, closure, stance = map(vector6, rounded_rows(vectors, _OF_STATUS))
             margin, margin_onboard = _rounded_down(output.local.margins)
         return PlannerStatus(
             t_ns=now_ns,
@@ -582,19 +581,7 @@ class Planner:
         )
 
 
-def _rounded(vectors: Sequence[Array], decimals: tuple[int, ...]) -> Array:
-    """Return the vectors as rows, each rounded to some decimals."""
-    rows: Array = np.concatenate(vectors).reshape(len(vectors), -1)
-    per_unit = _per_unit(decimals)
-    return np.divide(np.rint(np.multiply(rows, per_unit, rows), rows), per_unit, rows)
-
-
 def _rounded_down(margins: tuple[float, float]) -> tuple[float, float]:
     """Return margins with four decimals, never larger than they are."""
     service, onboard = margins
     return service * 1e4 // 1.0 / 1e4, onboard * 1e4 // 1.0 / 1e4
-
-
-@cache
-def _per_unit(decimals: tuple[int, ...]) -> Array:
-    return np.array([[10.0**count] for count in decimals])

@@ -154,7 +154,7 @@ class RunLog:
         """
         key = self._key(topic, module)
         if topic is topics.JOINT_COMMAND:
-            return [commands[MODULE_INDEX[module]] for _, commands in self._commands()]
+            return [command for _, command in self._commands(module)]
         series = self._of(key)
         if series.decoded is None:
             decode = msgspec.json.Decoder(topic.type).decode
@@ -188,7 +188,7 @@ class RunLog:
         The times are on the monotonic clock of the recorder's host.
         """
         if topic is topics.JOINT_COMMAND:
-            return [at_ns for at_ns, _ in self._commands()]
+            return [at_ns for at_ns, _ in self._commands(module)]
         return self._of(self._key(topic, module)).received_ns
 
     def holds(self, received_ns: int) -> bool:
@@ -237,15 +237,18 @@ class RunLog:
             for message, t_ns in zip(messages, times_ns, strict=True)
         ]
 
-    def _commands(self) -> list[tuple[int, list[JointCommand]]]:
-        """Return each tick's commands, with the stamp of their status and its reception."""
+    def _commands(self, module: str) -> list[tuple[int, JointCommand]]:
+        """Return a module's commands, with the stamps and reception times of their statuses."""
         statuses: list[PlannerStatus] = self.messages(topics.PLANNER_STATUS)
-        received = self.received_ns(topics.PLANNER_STATUS)
-        return [
-            (at_ns, [msgspec.structs.replace(row, t_ns=status.t_ns) for row in status.commands])
-            for at_ns, status in zip(received, statuses, strict=True)
-            if len(status.commands) == N_MODULES
-        ]
+        received, index = self.received_ns(topics.PLANNER_STATUS), MODULE_INDEX[module]
+        found = []
+        for at_ns, status in zip(received, statuses, strict=True):
+            if len(status.commands) == N_MODULES:
+                command = status.commands[index]
+                if command.t_ns != status.t_ns:  # converted to the recorder's clock
+                    command = msgspec.structs.replace(command, t_ns=status.t_ns)
+                found.append((at_ns, command))
+        return found
 
     def _key(self, topic: Topic, module: str) -> str:
         if topic.per_module != bool(module):

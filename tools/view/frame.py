@@ -318,7 +318,7 @@ class Mark(msgspec.Struct, frozen=True):
     text: str
 
 
-class ShownBody(msgspec.Struct, frozen=True):
+class _ShownBody(msgspec.Struct, frozen=True):
     """One body of the robot, in the frame of a module or of the torso."""
 
     frame: str
@@ -330,17 +330,17 @@ class ShownBody(msgspec.Struct, frozen=True):
     """Position of its centre."""
 
 
-def _bodies_of(robot: RobotConfig) -> tuple[ShownBody, ...]:
+def _bodies_of(robot: RobotConfig) -> tuple[_ShownBody, ...]:
     """Return the torso, and thigh, shin and sole of each leg."""
     geometry = robot.geometry
-    found = [ShownBody("torso", "cube", geometry.torso_size)]
+    found = [_ShownBody("torso", "cube", geometry.torso_size)]
     sole = (geometry.l_foot, geometry.w_foot, geometry.foot_height / 2)
     for side in SIDES:
         for kind, length in (("hip", geometry.l1), ("knee", geometry.l2)):
             size, middle = (0.06, 0.06, length), (0.0, 0.0, -length / 2)
-            found.append(ShownBody(f"{kind}_{side}", "cylinder", size, middle))
+            found.append(_ShownBody(f"{kind}_{side}", "cylinder", size, middle))
         below = (0.0, 0.0, -0.75 * geometry.foot_height)
-        found.append(ShownBody(f"ankle_{side}", "cube", sole, below))
+        found.append(_ShownBody(f"ankle_{side}", "cube", sole, below))
     return tuple(found)
 
 
@@ -370,7 +370,7 @@ class Model(msgspec.Struct, frozen=True):
     modes: dict[int, str]
     joints: dict[str, tuple[str, Vector3]]
     """By module: its parent frame, and its position there, m."""
-    bodies: tuple[ShownBody, ...]
+    bodies: tuple[_ShownBody, ...]
     harness: Vector3
     """Position on the torso, m."""
     foot: Vector3

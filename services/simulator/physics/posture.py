@@ -72,8 +72,8 @@ def measure_posture(data: Any, torso: int, feet: Sequence[int], ankles: Array) -
     yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
     moved = np.array([data.xpos[foot] for foot in feet]) - ankles
     return _MeasuredPosture(
-        com=_as_vector(data.subtree_com[0]),
-        torso=_as_vector(data.xpos[torso]),
+        com=as_vector(data.subtree_com[0]),
+        torso=as_vector(data.xpos[torso]),
         angles=(roll, pitch, yaw),
         tilts=[math.acos(min(1.0, data.xmat[foot][8])) for foot in feet],
         slip=float(np.linalg.norm(moved, axis=1).max()),
@@ -96,10 +96,10 @@ def sole_loads(model: Any, data: Any, feet: Sequence[int]) -> list[SoleLoad]:
         force = on.sum(axis=0)
         bears = abs(force[2]) > LEAST_N
         x, y = (on[:, 2] @ contact.pos[:, :2] / force[2]).tolist() if bears else (0.0, 0.0)
-        loads.append(SoleLoad(_as_vector(force), (x, y)))
+        loads.append(SoleLoad(as_vector(force), (x, y)))
     return loads
 
 
-def _as_vector(values: Array) -> Vector3:
+def as_vector(values: Array) -> Vector3:
     """Return three numbers as a tuple."""
     return float(values[0]), float(values[1]), float(values[2])

@@ -7,9 +7,9 @@ It steps the true robot (`services.simulator.physics.body`) without a robot file
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +17,7 @@ from services.simulator.physics.actuation import Actuation
 from services.simulator.physics.body import Body, FootPlacement
 from services.simulator.physics.operator import LedHand
 from services.simulator.physics.outside import OutsideForces, Torso
-from services.simulator.physics.posture import measure_posture, sole_loads
+from services.simulator.physics.posture import as_vector, measure_posture, sole_loads
 from shared.arrays import Array
 from shared.bus.messages import HandLead
 from shared.bus.traces import SimState, SimTruth
@@ -233,44 +233,44 @@ class World:
         moment = self._torso.rotation.reshape(3, 3)[:, 1] * outside.hand.moment_pitch
         right, left = sole_loads(self.model, self.data, placement.feet)
         self._truths += 1
-        return SimTruth(
+        truth = SimTruth(
             t_ns=t_ns,
             seq=self._truths,
+            scenario_s=self.scenario_s,
+            com=posture.com,
+            torso=posture.torso,
+            angles=posture.angles,
+            operator_force=(outside.hand_ahead, outside.hand_side, outside.hand.force_z),
+            operator_moment=as_vector(moment),
+            load_n=outside.wearer.load_n,
+            harness_force_z=outside.wearer.load_n - outside.hand.force_z,
+            push=outside.push,
+            foot_right_tilt=posture.tilts[0],
+            foot_left_tilt=posture.tilts[1],
+            feet_slip=posture.slip,
+            hoist=outside.hoist.share,
             fallen=self._fallen,
-            **_rounded(
-                scenario_s=self.scenario_s,
-                com=posture.com,
-                torso=posture.torso,
-                angles=posture.angles,
-                operator_force=(outside.hand_ahead, outside.hand_side, outside.hand.force_z),
-                operator_moment=moment.tolist(),
-                load_n=outside.wearer.load_n,
-                harness_force_z=outside.wearer.load_n - outside.hand.force_z,
-                push=outside.push,
-                foot_right_tilt=posture.tilts[0],
-                foot_left_tilt=posture.tilts[1],
-                feet_slip=posture.slip,
-                hoist=outside.hoist.share,
-                real_time_factor=real_time_factor,
-                late_s=late_s,
-                lean=self._lean,
-                foot_right_force=right.force,
-                foot_left_force=left.force,
-                foot_right_cop=right.cop,
-                foot_left_cop=left.cop,
-                feet=posture.feet,
-            ),
+            real_time_factor=real_time_factor,
+            late_s=late_s,
+            lean=self._lean,
+            foot_right_force=right.force,
+            foot_left_force=left.force,
+            foot_right_cop=right.cop,
+            foot_left_cop=left.cop,
+            feet=posture.feet,
         )
+        return _rounded(truth)
 
 
-def _rounded(**fields: float | Sequence[float]) -> dict[str, Any]:
-    """Return the fields, each number rounded to `POSITION` decimals."""
-    return {
-        name: tuple(round(float(number), POSITION) for number in value)
-        if isinstance(value, Sequence)
-        else round(float(value), POSITION)
-        for name, value in fields.items()
-    }
+def _rounded(truth: SimTruth) -> SimTruth:
+    """Return the truth with `POSITION` decimals in every number, also in those of vectors."""
+    fields: dict[str, Any] = msgspec.structs.asdict(truth)
+    for name, value in fields.items():
+        if isinstance(value, float):
+            fields[name] = round(value, POSITION)
+        elif isinstance(value, tuple):
+            fields[name] = tuple(round(number, POSITION) for number in value)
+    return SimTruth(**fields)
 
 
 def _turn_between(start: Array, end: Array) -> Array:

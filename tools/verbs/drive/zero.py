@@ -399,7 +399,7 @@ def _table(*columns: str) -> Table:
     return Table(*headings, box=box.SIMPLE_HEAD, caption="phi, theta", caption_justify="left")
 
 
-class StandAngles(NamedTuple):
+class _StandAngles(NamedTuple):
     """An upright stand, soles flat, COM over the ankles."""
 
     q: dict[str, Pair]
@@ -408,7 +408,7 @@ class StandAngles(NamedTuple):
     """Distance of the hips ahead of the ankles, m; negative if behind."""
 
 
-def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
+def stand_angles(robot: RobotConfig, height: float) -> _StandAngles:
     """Return the level stand whose torso origin (between the hips) is at a height, m."""
     from services.planner.law.kinematics import Kinematics  # noqa: PLC0415 - takes a second
     from tools.reach import ReachSolver, describe  # noqa: PLC0415
@@ -433,7 +433,7 @@ def stand_angles(robot: RobotConfig, height: float) -> StandAngles:
         if abs(height - z) <= HEIGHT_TOLERANCE:
             angles = ik.q.reshape(len(MODULES), 2).tolist()
             q = {module: (angles[i][0], angles[i][1]) for module, i in MODULE_INDEX.items()}
-            return StandAngles(q, float(kinematics.r_torso[0]))
+            return _StandAngles(q, float(kinematics.r_torso[0]))
         if before is not None and z != before[0]:
             slope = (z_com - before[1]) / (z - before[0])
         before = (z, z_com)
